@@ -77,19 +77,19 @@ PROGRAMS: dict[str, Program] = {
     "FPU, fully_explicit(5)": Program(FPU, vm.fully_explicit(5), 810),
     "FPU, fully_implicit(5)": Program(FPU, vm.fully_implicit(5), 2260),
     "FPU, fully_implicit(5), exact matrices": Program(FPU, vm.fully_implicit(5), 3460, "exact"),
-    "TSP, fully_explicit(5)": Program(TSP, vm.fully_explicit(5), 3100),
-    "TSP, fully_implicit(1)": Program(TSP, vm.fully_implicit(1), 2600),
-    "TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 3390),
-    "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5460, "exact"),
-    "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 4750),
-    "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7620, "exact"),
-    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 6470),
-    "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 3840),
-    "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 7450),
+    "TSP, fully_explicit(5)": Program(TSP, vm.fully_explicit(5), 3030),
+    "TSP, fully_implicit(1)": Program(TSP, vm.fully_implicit(1), 2530),
+    "TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 3320),
+    "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5360, "exact"),
+    "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 4610),
+    "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7410, "exact"),
+    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 6440),
+    "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 3150),
+    "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 6710),
     "gradient: double pendulum, fully_implicit(1)": Program(
-        double_pendulum, vm.fully_implicit(1), 4210, is_gradient=True
+        double_pendulum, vm.fully_implicit(1), 4130, is_gradient=True
     ),
-    "gradient: TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 8630, is_gradient=True),
+    "gradient: TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 8300, is_gradient=True),
 }
 
 

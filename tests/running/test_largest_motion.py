@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.running.failures import Motion, largest_motion
+from vmri_jax.running.failures import Move, largest_motion
 from vmri_jax.scene import Cylinder, RigidBody, Rod, Scene
 
 SPIN, H = 30.0, 0.04  # 1.2 rad a step: directors that multipliers hold reach no more than 1
 
 
-def largest(problem: vm.Problem, state: vm.State, macro_dt: float, names: vm.Names | None) -> Motion:
+def largest(problem: vm.Problem, state: vm.State, macro_dt: float, names: vm.Names | None) -> Move:
     """Of a step with ten micro steps."""
     motion = largest_motion(problem.system, state, names, macro_dt, 10)
     assert motion is not None

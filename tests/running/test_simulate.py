@@ -300,10 +300,9 @@ def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
     constrained = vm.prepare(cart(), vm.fully_explicit(1), macro_dt=0.02, num_steps=8, save=2)
     first, cursor, _ = constrained.advance(Cursor.at_start(constrained.state), 2)
     second, *_ = constrained.advance(cursor, 2)
-    columns = constrained.columns
-    for column in (columns.p_f, columns.table):
-        np.testing.assert_array_equal(second.rows[0, column], first.rows[-1, column])
-    assert constrained.table(second)[:, 2].max() < 1e-11
+    for column in ("p_f", "table"):
+        np.testing.assert_array_equal(getattr(second.nodes, column)[0], getattr(first.nodes, column)[-1])
+    assert second.nodes.table[:, 2].max() < 1e-11
 
     steep = fpu.system.replace(fast_potential=lambda q_f, params: jnp.log(1.2 - q_f[0]) - 1e2 * q_f[0])
     failed = until_failure(steep, vm.fully_explicit(1), fpu.state(), macro_dt=0.01, num_steps=60)

@@ -12,7 +12,8 @@ from vmri_jax import galerkin, quadrature, textbook
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.schemes.intervals import IntervalNodes, IntervalPath, Intervals
+from vmri_jax.schemes.interval_nodes import IntervalNodes, IntervalPath
+from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative, position_nodes, velocity_nodes
 from vmri_jax.schemes.quadrature import gauss, macro, micro, radau, simpson
 

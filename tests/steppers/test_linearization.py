@@ -15,8 +15,9 @@ from tests.user_systems import bent_system
 from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, quadrature
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.intervals import Intervals
-from vmri_jax.steppers.march import MarchEquations, inverse_with_multipliers, linearised_pass, solve
-from vmri_jax.steppers.newton.null_space import inverse_without_multipliers
+from vmri_jax.steppers.implicit import solve
+from vmri_jax.steppers.march import MarchEquations, linearised_pass
+from vmri_jax.steppers.null_space import inverse_with_multipliers, inverse_without_multipliers
 
 SCHEMES = {
     "fully implicit": fully_implicit(3),

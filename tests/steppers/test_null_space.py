@@ -14,8 +14,7 @@ from tests.scene.gallery_scenes import gallery_scene
 from tests.user_systems import cart
 from vmri_jax import systems
 from vmri_jax.diagnostics.linear import newton_matrix
-from vmri_jax.steppers.march import inverse_with_multipliers
-from vmri_jax.steppers.newton.null_space import inverse_without_multipliers, motions
+from vmri_jax.steppers.null_space import inverse_with_multipliers, inverse_without_multipliers, motions
 
 NULL_SPACE = vm.Solver("null_space")
 REFERENCE = "triple_spherical_pendulum", pytest.param("simple_atomic_model", marks=pytest.mark.full)

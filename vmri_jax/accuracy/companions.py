@@ -125,7 +125,7 @@ class Trial:
     def concerns(self) -> list[LostEnergyWarning]:
         """What is wrong with its motion."""
         run = self.run
-        return concerns(run.table(self.saved), self.trajectory.t, run.system, run.macro_dt, run.save_every)
+        return concerns(self.saved.nodes.table, self.trajectory.t, run.system, run.macro_dt, run.save_every)
 
     @cached_property
     def error(self) -> float:
@@ -267,8 +267,8 @@ def resting(run: Simulation) -> Trajectory:
     run = replace(run, save=Save())
     _, *phase = vars(run.state).values()
     row = np.concatenate([*phase, np.zeros(run.width - sum(map(len, phase)))])
-    saved = Saved(np.tile(row, (run.num_saves + 1, 1)), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
-    return saved.trajectory(run)
+    nodes = run.columns.split(np.tile(row, (run.num_saves + 1, 1)))
+    return Saved(nodes, np.asarray(int(Result.CONVERGED)), np.asarray(-1)).trajectory(run)
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:

@@ -8,7 +8,6 @@ import numpy as np
 
 from vmri_jax.kernels.band import Full, Sparsity, sparsity
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
-from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 
 MOST_ROWS_OF_FULL_MATRIX = 80
@@ -24,9 +23,7 @@ dependences, which costs iterations; a smaller one takes round-off for a depende
 def all_rows(system: System, q_s, q_f) -> Sparsity:
     """Sparsity of ``G M^-1 G^T`` with all constraints, for coordinates of these shapes."""
     count = sum(system.num_constraints(q_s, q_f))
-    kinetic = system.kinetic
-    diagonal = isinstance(kinetic, ConstantMass) and kinetic.slow_mass.is_diagonal and kinetic.fast_mass.is_diagonal
-    if count <= MOST_ROWS_OF_FULL_MATRIX or not diagonal:
+    if count <= MOST_ROWS_OF_FULL_MATRIX or not (system.has_constant_mass and system.kinetic.is_diagonal):
         return Full(count)
     return _shared(system, q_s.shape[0], q_f.shape[0])
 

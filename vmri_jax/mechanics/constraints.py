@@ -1,14 +1,6 @@
 """Checks of constraints and masses at one configuration (kept, independent, regular).
 
-Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints counts as kept below
-
-    allowed_i = tolerance size_i + ROUNDING eps (terms_i + reach_i)
-    size_i = max(terms_i, min(|G_i|^2 / |hess g_i|, reach_i))        reach_i = sum_j |dg_i/dq_j| / w_j max_k |w_k q_k|
-
-with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), and its change over
-its radius of curvature. The weights w, square roots of the masses, give all coordinates one unit: lengths of gradients
-and reach_i, the change of a row over the largest position, which bounds its round-off, are taken with them. Mass
-matrices are judged with a diagonal of ones.
+Rows are judged in their own units (`vmri_jax.mechanics.slopes`), mass matrices with a diagonal of ones.
 """
 
 from contextlib import nullcontext
@@ -17,14 +9,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from vmri_jax.kernels import matvec, max_abs
-from vmri_jax.mechanics.arrays import Numbers, is_known, library, numbers_of, quickly_compiled
+from vmri_jax.mechanics.arrays import is_known, numbers_of, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.masses import correlation
-from vmri_jax.mechanics.projection import mass_and_momentum, time_rates
-from vmri_jax.mechanics.structure import sizes_of_terms
+from vmri_jax.mechanics.projection import mass_and_momentum
+from vmri_jax.mechanics.slopes import ScaledRows, slopes_at, weights_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
@@ -40,10 +30,6 @@ A smaller value would refuse starts that are rounded to six digits.
 CONSTRAINT_OVER_TOLERANCE = 100
 """Loose Newton tolerances raise the value of a row that is kept, relative to its size, to this factor times the
 tolerance. A smaller factor would refuse converged steps."""
-ROUNDING = 100
-"""Value of a row in units of its rounding, ``eps (terms + reach)``, that always counts as zero: a row has tens of
-operations. A smaller value refuses starts far from the origin, a larger one lets short rods there have the wrong
-length."""
 RANK = 1e-8
 """Largest singular value of a dependence among rows of length one.
 
@@ -115,69 +101,7 @@ def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
     return jnp.isfinite(whole).all() & (too_many | (values[-1] <= tolerance))
 
 
-class Rows(NamedTuple):
-    """The rows at a configuration: those that are solved for, then the implied ones; see the top of this module.
-
-    values: g.
-    sizes: size_i.
-    rounding: ``terms_i + reach_i``.
-    gradients: ``dg_i/dq_j / w_j`` with respect to (q_s, q_f).
-    """
-
-    values: Float[Numbers, "k"]
-    sizes: Float[Numbers, "k"]
-    rounding: Float[Numbers, "k"]
-    gradients: Float[Numbers, "k n"]
-
-    def allowed(self, tolerance):
-        """(k,) the values up to which rows count as kept."""
-        return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * self.rounding
-
-    @classmethod
-    def of(cls, function, q, weights: Any = 1.0) -> "Rows":
-        """The rows (k,) of a function of q (n,)."""
-        direction = np.random.default_rng(0).normal(size=q.size) / weights
-
-        def gradients_and_values(q):
-            values, pull = jax.vjp(function, q)
-            return jax.vmap(pull)(jnp.eye(values.size))[0], values
-
-        gradients, bends, values = jax.jvp(gradients_and_values, (q,), (direction,), has_aux=True)
-        gradients, bends = gradients / weights, bends / weights
-        terms, reach = sizes_of_terms(function, q), jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * q))
-        # |hess g e| of a random direction e for the norm of the Hessian
-        squared, bend = jnp.sum(gradients**2, axis=1), jnp.linalg.norm(bends, axis=1)
-        radius = jnp.where(bend > 0, squared / jnp.where(bend > 0, bend, 1.0), 0.0)
-        return cls(values, jnp.maximum(terms, jnp.minimum(radius, reach)), terms + reach, gradients)
-
-
-def rows_at(system: System, t, q_s, q_f, weights) -> Rows:
-    """The `Rows` of a system, for weights w (n,) of the coordinates."""
-    n_s = q_s.shape[0]
-    return Rows.of(lambda q: _values(system, t, q[:n_s], q[n_s:]), jnp.concatenate([q_s, q_f]), weights)
-
-
-def _values(system: System, *configuration):
-    """(k,) values of all rows."""
-    return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
-
-
-def residual_of(rows: Rows, system: System, state, weighted_velocity):
-    """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their
-    weights."""
-    rates, t = matvec(rows.gradients, weighted_velocity), state.t
-    if any(term.moves for term in system.terms):
-        rates += jax.jvp(lambda t: _values(system, t, state.q_s, state.q_f), (t,), (jnp.ones_like(t),))[1]
-    return jnp.stack([max_abs(rows.values), max_abs(rates)])
-
-
-def weights_of(masses):
-    """(n,) the weights w: square roots of masses, 1 for a coordinate without a mass."""
-    xp = library(masses)
-    return xp.sqrt(xp.where(masses > 0, masses, 1.0))
-
-
-def are_kept(rows: Rows, solved: int, tolerance):
+def are_kept(rows: ScaledRows, solved: int, tolerance):
     """Whether a state of a run keeps the rows that are solved for, and the implied ones.
 
     Args:
@@ -191,10 +115,10 @@ def are_kept(rows: Rows, solved: int, tolerance):
 
 
 class Configuration(NamedTuple):
-    """The `Rows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the Jacobian G,
-    and dg/dt."""
+    """The `ScaledRows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the
+    Jacobian G, and dg/dt."""
 
-    rows: Rows
+    rows: ScaledRows
     mass: Any
     values: Any
     jacobian: Any
@@ -206,15 +130,15 @@ def configuration(system: System, t, q_s, q_f, mass=None) -> Configuration:
     of a start, its momenta, and its checks."""
     if mass is None:
         mass, _ = mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))
-    weights = weights_of(mass.diagonal())
-    rows, rates = numbers_of(_rows_and_rates(system, t, q_s, q_f, weights))
-    solved = len(rates)
-    return Configuration(rows, mass, rows.values[:solved], rows.gradients[:solved] * weights, rates)
+    solved = sum(system.num_constraints(q_s, q_f))
+    rows, *of_all = numbers_of(_rows_and_slopes(system, t, q_s, q_f, weights_of(mass.diagonal())))
+    return Configuration(rows, mass, *(a[:solved] for a in of_all))
 
 
 @quickly_compiled
-def _rows_and_rates(system, t, q_s, q_f, weights):
-    return rows_at(system, t, q_s, q_f, weights), time_rates(system, t, q_s, q_f)
+def _rows_and_slopes(system, t, q_s, q_f, weights):
+    slopes = slopes_at(system, t, q_s, q_f)
+    return slopes.scaled(weights), slopes.values, slopes.jacobian, slopes.rates
 
 
 def check_mass(system: System, q_s, q_f) -> None:
@@ -355,7 +279,7 @@ def _held(system: System, state) -> list[Held]:
     return [Held(term, values, *parts[term.field]) for term in system.of_kind("constraint")]
 
 
-def _check_gradients(system: System, state, held: list[Held], rows: Rows, weights) -> None:
+def _check_gradients(system: System, state, held: list[Held], rows: ScaledRows, weights) -> None:
     """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its
     positions."""
     q = np.concatenate([state.q_s, state.q_f])
@@ -372,7 +296,7 @@ def _check_gradients(system: System, state, held: list[Held], rows: Rows, weight
             )
 
 
-def _check_implied(rows: Rows, solved: int, place: str) -> None:
+def _check_implied(rows: ScaledRows, solved: int, place: str) -> None:
     values, allowed = rows.values[solved:], rows.allowed(CONSTRAINT_TOLERANCE)[solved:]
     opened = np.flatnonzero(~(np.abs(values) <= allowed))
     if opened.size:
@@ -383,7 +307,7 @@ def _check_implied(rows: Rows, solved: int, place: str) -> None:
         )
 
 
-def _nearby(state, rows: Rows, weights):
+def _nearby(state, rows: ScaledRows, weights):
     """A generic configuration at a distance `NEARBY` from a state, always the same; the distance over which a row
     changes by its size is 1."""
     lengths = np.linalg.norm(rows.gradients, axis=1)

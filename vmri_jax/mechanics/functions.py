@@ -10,7 +10,7 @@ import dataclasses
 import inspect
 from collections import Counter
 from collections.abc import Callable, Hashable
-from functools import lru_cache, partial, wraps
+from functools import lru_cache, wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -237,7 +237,6 @@ def check_arguments(place: str, function: Callable, arguments: str, instead: str
     raise Refused(f"{place} is {name}{signature}; it is called with ({arguments}). {advice}")
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["function"], meta_fields=[])
 @dataclasses.dataclass(frozen=True)
 class Rheonomic:
     """A holonomic constraint that depends on time: a function with the time as its first argument.

@@ -5,8 +5,8 @@ from operator import add
 
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.constraints import residual_of, rows_at
 from vmri_jax.mechanics.projection import have_closed_masses, project_momentum
+from vmri_jax.mechanics.slopes import slopes_at
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -68,8 +68,7 @@ def constraint_residual(system: System, state: State, velocities=None):
         velocities: (v_s, v_f) of the momenta if they are known.
     """
     velocities = velocities or velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
-    rows = rows_at(system, state.t, state.q_s, state.q_f, weights=1.0)
-    return residual_of(rows, system, state, jnp.concatenate(velocities))
+    return slopes_at(system, state.t, state.q_s, state.q_f).residual(jnp.concatenate(velocities))
 
 
 def all_constraints(system: System, state: State, velocities=None):
@@ -92,8 +91,8 @@ def velocity(system: System, q_s, q_f, p_s, p_f):
 
 def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
     """`velocity`, and the mass matrix ``d^2 T / dv^2`` (n, n); None for constant masses."""
-    free = system.only(lambda term: term.kind not in ("constraint", "implied"))
-    _, _, v_s, v_f, masses = project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))
+    state, none = State(jnp.zeros(()), q_s, q_f, p_s, p_f), (jnp.zeros((0, q_s.size + q_f.size)), jnp.zeros(0))
+    _, _, v_s, v_f, masses = project_momentum(system, state, constraints=none)
     return (v_s, v_f), masses
 
 

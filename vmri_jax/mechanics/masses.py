@@ -81,6 +81,11 @@ class ConstantMass(eqx.Module):
         return _operator(self.fast)
 
     @property
+    def is_diagonal(self) -> bool:
+        """Whether there are masses alone, no matrix."""
+        return self.slow_mass.is_diagonal and self.fast_mass.is_diagonal
+
+    @property
     def diagonal(self):
         """The diagonals (n_s,) of M_s and (n_f,) of M_f."""
         return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in (self.slow, self.fast))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.invariants import lagrangian, velocity, velocity_and_masses
+from vmri_jax.mechanics.projection import time_rates
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -93,7 +94,6 @@ def powers(system: System, state: State):
         f_s, f_f = system.forces(state.t, state.q_s, state.q_f, v_s, v_f)
         of_forces = jnp.sum(f_s * v_s) + jnp.sum(f_f * v_f)
     if system.is_rheonomic:
-        at_rest = jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f)
-        time_rates = system.constraint_rates(state.t, state.q_s, state.q_f, *at_rest)  # dg/dt at fixed positions
-        of_constraints = jnp.sum(motion(system, state).multipliers * time_rates)
+        rates = time_rates(system, state.t, state.q_s, state.q_f)
+        of_constraints = jnp.sum(motion(system, state).multipliers * rates)
     return jnp.stack([of_forces, of_constraints])

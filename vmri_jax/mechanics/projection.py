@@ -85,7 +85,7 @@ def closed_masses(energies: Iterable[Term], q_s, q_f, params):
     return first.mass_matrix(q_s, q_f, params, *others)
 
 
-def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
+def project_momentum(system: System, state, guess=None, constraints=None, sparsity: Sparsity | None = None):
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their
     velocities.
 
@@ -98,46 +98,44 @@ def project_momentum(system: System, state, guess=None, sparsity: Sparsity | Non
         system: with its kinetic energy and constraints.
         state: a `State`: time, positions and momenta.
         guess: velocities (v_s, v_f) from which Newton's iteration starts, by default zero.
+        constraints: G (m, n) and dg/dt (m,); None for those of the system.
         sparsity: of ``G M^-1 G^T``, for constant masses; found if it is None.
 
     Returns:
         (p_s, p_f, v_s, v_f, masses), the last one the mass matrix ``d2T/dv2`` (n, n), None for constant masses; NaN
         where Newton's iteration does not converge.
     """
-    if system.has_constant_mass:
-        return *_with_constant_masses(system, state, sparsity), None
-    return _with_masses(system, state, guess)
-
-
-def _with_constant_masses(system: System, state, sparsity: Sparsity | None):
-    t, q_s, q_f, p_s, p_f = state.t, state.q_s, state.q_f, state.p_s, state.p_f
-    velocity = system.kinetic.velocity
-    constraints = partial(system.constraints, t)
-    g, pull = jax.vjp(constraints, q_s, q_f)
-    if g.size:
-        push = jax.linearize(constraints, q_s, q_f)[1]
-        sparsity = sparsity or all_rows(system, q_s, q_f)
-        # G M^-1 times G^T seeds and p: one map for all, since each use of `push` is compiled anew
-        impulses = zip(jax.vmap(pull)(sparsity.seeds), (p_s, p_f), strict=True)
-        pushed = jax.vmap(lambda *p: push(*velocity(*p)))(*(jnp.concatenate([a, p[None]]) for a, p in impulses))
-        products, rates = pushed[:-1], pushed[-1]
-        if system.is_rheonomic:
-            rates = rates + time_rates(system, t, q_s, q_f)
-        mu = sparsity.solve(products, rates)
-        pull_s, pull_f = pull(mu)
-        p_s, p_f = p_s - pull_s, p_f - pull_f
-    return p_s, p_f, *velocity(p_s, p_f)
-
-
-def _with_masses(system: System, state, guess):
     t, q_s, q_f, n_s = state.t, state.q_s, state.q_f, state.q_s.size
     p = jnp.concatenate([state.p_s, state.p_f])
+    if constraints is None:
+        jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)
+        constraints = jacobian, time_rates(system, t, q_s, q_f)
+    if system.has_constant_mass:
+        (p, v), masses = _with_constant_masses(system, q_s, q_f, p, constraints, sparsity), None
+    else:
+        p, v, masses = _with_masses(system, q_s, q_f, p, constraints, guess)
+    return p[:n_s], p[n_s:], v[:n_s], v[n_s:], masses
 
+
+def _with_constant_masses(system: System, q_s, q_f, p, constraints, sparsity: Sparsity | None):
+    jacobian, rates = constraints
+
+    def over_masses(p):
+        """``M^-1 p`` for (..., n)."""
+        return jnp.concatenate(system.kinetic.velocity(p[..., : q_s.size], p[..., q_s.size :]), axis=-1)
+
+    if rates.size:
+        sparsity = sparsity or all_rows(system, q_s, q_f)
+        seeded = jacobian if isinstance(sparsity, Full) else matmul(sparsity.seeds, jacobian)
+        products = matmul(over_masses(seeded), jacobian.T)
+        p -= matvec(jacobian.T, sparsity.solve(products, matvec(jacobian, over_masses(p)) + rates))
+    return p, over_masses(p)
+
+
+def _with_masses(system: System, q_s, q_f, p, constraints, guess):
     def kinetic(v):
-        return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
+        return system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :])
 
-    jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
-    constraints = jacobian, time_rates(system, t, q_s, q_f)
     v = gradient = jnp.zeros_like(p)
     masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
     is_quadratic = masses is not None or has_constant_hessian(kinetic, p)
@@ -148,10 +146,7 @@ def _with_masses(system: System, state, guess):
         masses, gradient = _masses_of_function(system, q_s, q_f, v)
     if is_quadratic:
         v, impulse = _by_one_solve(masses, p - gradient, *constraints)  # p = M v + dT/dv(0)
-    momenta = state.p_s, state.p_f
-    if jacobian.shape[0]:
-        momenta = state.p_s - impulse[:n_s], state.p_f - impulse[n_s:]
-    return *momenta, v[:n_s], v[n_s:], masses
+    return (p - impulse if constraints[1].size else p), v, masses
 
 
 def _by_one_solve(masses, p, jacobian, rates):

@@ -1,6 +1,5 @@
 """The physics of a system: plain JAX functions of slow and fast variables, written by the user."""
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,10 +14,8 @@ from vmri_jax.mechanics.functions import (
     NO_VELOCITY,
     Order,
     Rheonomic,
-    TracedOnce,
     check_arguments,
     order_of,
-    traced_once,
 )
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.slots import check_computed
@@ -41,6 +38,16 @@ _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",
 }
+
+
+def _argument(field: str) -> Any:
+    """The property with the function of this argument of `System`; None without a function."""
+
+    def function(system: "System"):
+        term = next((term for term in system.terms if term.field == field), None)
+        return term and (Rheonomic(term.function) if term.moves else term.function)
+
+    return property(function)
 
 
 class System(eqx.Module):
@@ -74,22 +81,15 @@ class System(eqx.Module):
 
     A run uses what its functions read from around them when it is made: globals, helpers, closures, attributes, see
     `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything
-    is compiled again, so that what varies belongs in `params`. They are kept as `TracedOnce`, so that ``system.force``
-    is called like the function itself, which is the innermost ``function`` of it.
+    is compiled again, so that what varies belongs in `params`. A system stores its `terms`, and shows the arguments
+    above as attributes. Functions are kept as `TracedOnce`, so that ``system.force`` is called like the function
+    itself, which is the innermost ``function`` of it.
     """
 
-    kinetic: Any
-    slow_potential: TracedOnce | None = None
-    fast_potential: TracedOnce | None = None
-    constraint: TracedOnce | Rheonomic | None = None
-    slow_constraint: TracedOnce | Rheonomic | None = None
-    force: TracedOnce | None = None
-    params: Any = None
-    implied: TracedOnce | Rheonomic | None = None
-    slow_kinetic: TracedOnce | None = None
-    potentials: Named[TracedOnce] = eqx.field(default_factory=Named)
+    terms: tuple[Term, ...]
+    params: Any
 
-    def __init__(  # Equinox flattens the arguments of a generated one, and potentials may have names of two types
+    def __init__(
         self,
         kinetic,
         slow_potential=None,
@@ -103,18 +103,7 @@ class System(eqx.Module):
         slow_kinetic=None,
         potentials=None,
     ):
-        functions = {
-            "slow_potential": slow_potential,
-            "fast_potential": fast_potential,
-            "constraint": constraint,
-            "slow_constraint": slow_constraint,
-            "force": force,
-            "implied": implied,
-            "slow_kinetic": slow_kinetic,
-        }
-        order = order_of(params)
-        for name, function in functions.items():
-            setattr(self, name, _checked(name, function, order))
+        given, order, terms = locals(), order_of(params), []
         if isinstance(kinetic, ConstantMass) and slow_kinetic is not None:
             raise Refused(
                 "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; "
@@ -125,21 +114,29 @@ class System(eqx.Module):
                 f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function kinetic(q_s, q_f, v_s, "
                 "v_f, params)."
             )
-        self.kinetic = kinetic if isinstance(kinetic, ConstantMass) else _checked("kinetic", kinetic, order)
-        self.params = params
-        self.potentials = _named_potentials(potentials or (), order)
+        for field, kind in KINDS.items():
+            if field == "potentials":
+                terms += [_checked(field, name, V, order) for name, V in _named(potentials or ()).items()]
+            elif given[field] is not None:
+                terms.append(_checked(field, kind.symbol, given[field], order))
+        self.terms, self.params = tuple(terms), params
+
+    kinetic = _argument("kinetic")
+    slow_kinetic = _argument("slow_kinetic")
+    slow_potential = _argument("slow_potential")
+    fast_potential = _argument("fast_potential")
+    constraint = _argument("constraint")
+    slow_constraint = _argument("slow_constraint")
+    force = _argument("force")
+    implied = _argument("implied")
+
+    @property
+    def potentials(self) -> Named[Any]:
+        """The further potentials by name."""
+        return Named({term.name: term.function for term in self.terms if term.field == "potentials"})
 
     def __repr__(self) -> str:
         return summary("System", self.in_words())
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """The terms that the system has, see `vmri_jax.mechanics.terms`."""
-        terms = []
-        for field in KINDS:
-            functions = self.potentials if field == "potentials" else {"": getattr(self, field)}
-            terms += [Term.of(field, function, name) for name, function in functions.items() if function is not None]
-        return tuple(terms)
 
     def of_kind(self, kind: str) -> tuple[Term, ...]:
         """The terms of a kind, of `vmri_jax.mechanics.terms`."""
@@ -147,18 +144,13 @@ class System(eqx.Module):
 
     def only(self, keep: Callable[[Term], bool]) -> "System":
         """The system with its kinetic energy, and with the other terms for which `keep` is true."""
-        return self.mapped(lambda term: term.function if term.kind == "kinetic" or keep(term) else None)
+        return _changed(self, terms=tuple(term for term in self.terms if term.kind == "kinetic" or keep(term)))
 
     def mapped(self, changed: Callable[[Term], Any]) -> "System":
         """The system whose functions are those that `changed` returns for its terms, each in place of its function;
-        None for no function."""
-        fields: dict[str, Any] = {"potentials": {}}
-        for term, function in [(term, changed(term)) for term in self.terms]:
-            if function is not None and term.field == "potentials":
-                fields["potentials"][term.name] = function
-            elif function is not None:
-                fields[term.field] = term.in_system(function)
-        return System(**fields, params=self.params)
+        None for no function. They are not checked."""
+        order, pairs = order_of(self.params), ((term, changed(term)) for term in self.terms)
+        return _changed(self, terms=tuple(term.with_function(f, order) for term, f in pairs if f is not None))
 
     def in_words(self) -> dict[str, str]:
         """The terms and the params in words, for summaries."""
@@ -177,7 +169,7 @@ class System(eqx.Module):
             ValueError: changed numbers that a scene computes, see `with_params`.
         """
         check_computed(self.params, changes.get("params"))
-        return dataclasses.replace(self, **changes)
+        return System(**{name: getattr(self, name) for name in (*KINDS, "params")} | changes)
 
     def with_params(self, params) -> "System":
         """The same system with other parameters, without the checks of the constructor, which take a millisecond.
@@ -187,10 +179,7 @@ class System(eqx.Module):
                 ``gravity.mass``.
         """
         check_computed(self.params, params)
-        system = object.__new__(type(self))
-        for name, value in {**vars(self), "params": params}.items():
-            object.__setattr__(system, name, value)
-        return system
+        return _changed(self, params=params)
 
     def all_potentials(self, q_s, q_f) -> dict:
         """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W. A potential named
@@ -203,8 +192,8 @@ class System(eqx.Module):
 
     def kinetic_energy(self, q_s, q_f, v_s, v_f):
         """``T + T_s``."""
-        energy = self.kinetic(q_s, q_f, v_s, v_f, self.params)
-        return energy if self.slow_kinetic is None else energy + self.slow_kinetic(q_s, v_s, self.params)
+        T, *others = (term(self.params, q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f) for term in self.of_kind("kinetic"))
+        return sum(others, T)
 
     def g(self, t, q_s, q_f):
         """Values of `constraint`, shape (n_g,); n_g = 0 without a constraint."""
@@ -219,8 +208,7 @@ class System(eqx.Module):
         return self._rows("implied", t=t, q_s=q_s, q_f=q_f)
 
     def _rows(self, field: str, **values):
-        function = getattr(self, field)
-        return jnp.zeros(0) if function is None else Term.of(field, function)(self.params, **values)
+        return next((term(self.params, **values) for term in self.terms if term.field == field), jnp.zeros(0))
 
     @property
     def has_constant_mass(self) -> bool:
@@ -230,12 +218,12 @@ class System(eqx.Module):
     @property
     def is_constrained(self) -> bool:
         """Whether there are constraints."""
-        return not (self.constraint is self.slow_constraint is None)
+        return any(term.kind == "constraint" for term in self.terms)
 
     @property
     def is_rheonomic(self) -> bool:
         """Whether constraints depend on time."""
-        return any(isinstance(function, Rheonomic) for function in (self.constraint, self.slow_constraint))
+        return any(term.kind == "constraint" and term.moves for term in self.terms)
 
     @property
     def keeps_energy(self) -> bool:
@@ -264,22 +252,28 @@ class System(eqx.Module):
         return jax.eval_shape(self.g, t, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, t, q_s).shape[0]
 
 
-def _checked(name: str, function: Any, order: Order | None, place: str = "") -> Any:
-    """The function of a field as `TracedOnce` or `Rheonomic`, after checks; None for no function.
+def _changed(system: System, **changes) -> System:
+    """The same system with another tuple of terms, or with other params, without checks. No method: Equinox takes
+    tens of microseconds to call one."""
+    other = object.__new__(System)
+    vars(other).update(vars(system) | changes)
+    return other
 
-    `order` is of the params, `place` for messages.
-    """
-    kind, place = KINDS[name], f"System: {place or name}"
-    if function is None and name != "potentials":
-        return None
-    holds = kind.kind in ("constraint", "implied")
-    inner, call, moves = function, kind.call, False
+
+def _checked(field: str, name: str | int, function: Any, order: Order | None) -> Term:
+    """The term of an argument of `System`, after checks; `order` is of the params."""
+    term = Term(field, name, KINDS[field].arguments, function)
+    holds = term.kind in ("constraint", "implied")
     if isinstance(function, Rheonomic) and holds:
-        inner, call, moves = function.function, f"t, {call}", True
+        term = Term(field, name, ("t", *term.arguments), function.function)
+    inner = term.function
+    place = f"System: {term.place}"
     if isinstance(inner, ConstantMass):
+        if field == "kinetic":
+            return term
         raise Refused(f"{place} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
     if not callable(inner):
-        raise Refused(f"{place} is {function!r}; it must be a function{' or None' * (name != 'potentials')}.")
+        raise Refused(f"{place} is {function!r}; it must be a function{' or None' * (field != 'potentials')}.")
     try:
         hash(inner)
     except TypeError:
@@ -287,16 +281,15 @@ def _checked(name: str, function: Any, order: Order | None, place: str = "") -> 
             f"{place} is {inner!r}, which has no hash: programs are compiled once per function. Give a plain function, "
             "with what varies in params."
         ) from None
-    instead = "" if name == "force" else NO_VELOCITY if holds else NO_TIME
-    if name == "fast_potential" and "q_s" in getattr(getattr(inner, "__code__", None), "co_varnames", ()):
+    instead = "" if field == "force" else NO_VELOCITY if holds else NO_TIME
+    if field == "fast_potential" and "q_s" in getattr(getattr(inner, "__code__", None), "co_varnames", ()):
         instead = FAST_ALONE
-    check_arguments(place, inner, call, instead.format(**_INSTEAD))
-    traced = traced_once(inner, order)
-    return Rheonomic(traced) if moves else traced
+    check_arguments(place, inner, ", ".join((*term.arguments, "params")), instead.format(**_INSTEAD))
+    return term.with_function(inner, order)
 
 
-def _named_potentials(potentials, order: Order | None) -> Named:
-    """Functions by name, from a mapping or from pairs."""
+def _named(potentials) -> dict:
+    """Functions by name, from a mapping or from pairs, after checks of the names."""
     try:
         named = dict(potentials)
     except (TypeError, ValueError):
@@ -315,5 +308,4 @@ def _named_potentials(potentials, order: Order | None) -> Named:
                 f"System: potentials has the name {name!r}, which is the name of another term: one of "
                 f"{', '.join(RESERVED)}, or V_k of the potential k. Take another name."
             )
-    places = {name: f"potentials[{name!r}]" for name in named}
-    return Named({name: _checked("potentials", named[name], order, place) for name, place in places.items()})
+    return named

@@ -16,11 +16,14 @@ A constraint or implied row that is `Rheonomic` gets t before the other argument
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import jax
 
-from vmri_jax.mechanics.functions import Rheonomic
+from vmri_jax.mechanics.functions import Order, traced_once
+from vmri_jax.mechanics.masses import ConstantMass
 
 POSITIONS, VELOCITIES = ("q_s", "q_f"), ("v_s", "v_f")
 Value = TypeVar("Value")
@@ -51,11 +54,6 @@ class Kind(NamedTuple):
     arguments: tuple[str, ...]
     in_words: str
 
-    @property
-    def call(self) -> str:
-        """The arguments of a call, ``q_s, q_f, params``."""
-        return ", ".join((*self.arguments, "params"))
-
 
 KINDS: dict[str, Kind] = {
     "kinetic": Kind("T", "kinetic", (*POSITIONS, *VELOCITIES), "kinetic energy"),
@@ -71,28 +69,21 @@ KINDS: dict[str, Kind] = {
 """The functions of a system, by the argument of `System`, in the order of summaries."""
 
 
-class Term(NamedTuple):
+@partial(jax.tree_util.register_dataclass, data_fields=["function"], meta_fields=["field", "name", "arguments"])
+@dataclass(frozen=True)
+class Term:
     """A function of a system.
 
     field: the argument of `System` that has it.
     name: its symbol, or the name of a further potential: a text, or a whole number k.
-    kind: as of `Kind`.
     arguments: names of its arguments, without params: some of t, q_s, q_f, v_s, v_f.
+    function: `TracedOnce`, or a `ConstantMass`.
     """
 
     field: str
     name: str | int
-    kind: str
     arguments: tuple[str, ...]
     function: Callable
-
-    @classmethod
-    def of(cls, field: str, function: Callable | Rheonomic, name: str | int = "") -> "Term":
-        """The term of a function of `System`; `name` is of a further potential."""
-        kind = KINDS[field]
-        if isinstance(function, Rheonomic):
-            return cls(field, kind.symbol, kind.kind, ("t", *kind.arguments), function.function)
-        return cls(field, kind.symbol or name, kind.kind, kind.arguments, function)
 
     def __call__(self, params, **values):
         """The value of the function, with its arguments by name among `values`."""
@@ -101,6 +92,16 @@ class Term(NamedTuple):
     def of_arguments(self, values) -> list:
         """Its arguments, in order, out of a mapping by name."""
         return [values[name] for name in self.arguments]
+
+    def with_function(self, function: Callable, order: Order | None) -> "Term":
+        """The term with another function of the same arguments; `order` is of the params."""
+        is_mass = isinstance(function, ConstantMass)
+        return replace(self, function=function if is_mass else traced_once(function, order))
+
+    @property
+    def kind(self) -> str:
+        """Its kind, see `Kind`."""
+        return KINDS[self.field].kind
 
     @property
     def label(self) -> str:
@@ -114,12 +115,8 @@ class Term(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """Whether its rows depend on time, so that `System` takes its function as `Rheonomic`."""
+        """Whether its rows depend on time: `System` takes and shows its function as `Rheonomic`."""
         return "t" in self.arguments and self.kind != "force"
-
-    def in_system(self, function: Callable) -> Any:
-        """Another function with the same arguments, as an argument of `System`."""
-        return Rheonomic(function) if self.moves else function
 
 
 def label(name: str | int) -> str:

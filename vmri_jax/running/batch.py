@@ -52,7 +52,7 @@ def computed(runs: Simulation, width: int, devices: int) -> Saved:
         padded = failed[np.minimum(np.arange(2 ** int(failed.size - 1).bit_length()), failed.size - 1)]
         with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
             again = _in_chunks(run.exact, runs.leaves, padded, width, devices)
-        for old, new in zip(done, again, strict=True):
+        for old, new in zip(*map(jax.tree.leaves, (done, again)), strict=True):
             old[failed] = new[: failed.size]
     return done
 
@@ -71,7 +71,7 @@ def _in_chunks(run: Simulation, leaves: list, lanes: np.ndarray, width: int, dev
         chosen = lanes[np.minimum(np.arange(start, start + width), len(lanes) - 1)]
         chunks.append(program([a[0] if is_repeated(a) else a[chosen] for a in leaves], run.save_every))
     rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(lanes)], *chunks)
-    return Saved(rows[:, : run.num_saves + 1], *status.T.copy()).marked(run)
+    return Saved(run.columns.split(rows[:, : run.num_saves + 1]), *status.T.copy()).marked(run)
 
 
 def batch(

@@ -4,7 +4,7 @@ states and statuses, and beside each saved state its `Observables`, which it com
 Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved intervals fit into the arrays of an
 engine; a call computes the first `saves` of them.
 
-The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse
+The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.implicit`). Reverse
 mode visits the steps from the last to the first and needs the state at which each step started, see `loops`. Runs have
 derivatives in both modes, up to second ones; third derivatives are NaN where equations are solved by iteration.
 
@@ -27,7 +27,7 @@ from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
 from vmri_jax.running import loops
 from vmri_jax.running.observables import observed
-from vmri_jax.running.saved import Saved
+from vmri_jax.running.saved import Columns, Saved
 from vmri_jax.steppers.plan import Plan
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.stepper import StepStatus
@@ -121,7 +121,8 @@ class Engine:
 
         def block(i, rows):
             number = jnp.minimum(i * self._block + jnp.arange(self._block), saves)  # beyond it there may be no state
-            row = jnp.concatenate(_as_saved(run, rows[number], step + number * save_every), axis=1)
+            nodes = run.columns.split(rows[number])
+            row = jnp.concatenate(_as_saved(run, nodes, step + number * save_every), axis=1)
             return jax.lax.dynamic_update_slice(rows, row, (i * self._block, 0))
 
         return jax.lax.fori_loop(0, saves // self._block + 1, block, rows)
@@ -144,7 +145,8 @@ class Engine:
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
             cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves, in_parts, save_every)
             first = _row(run.state, *_nothing(run))
-            return Saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
+            nodes = run.columns.split(jnp.concatenate([first[None], rows]))
+            return Saved(nodes, cursor.result, cursor.failed_at)
 
         return jax.jit(by_scan, static_argnums=1)
 
@@ -154,13 +156,8 @@ class Engine:
 
         def observed(leaves: list, saved: Saved, save_every) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            columns = _as_saved(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
-            rows = jax.lax.stop_gradient(jnp.concatenate(columns, axis=1))
-            marked = saved._replace(rows=rows).marked(replace(run, save_every=save_every))
-            # Column by column: the derivative of positions then has no part of that of the observables beside them.
-            lost = jnp.isnan(marked.rows[:, run.columns.table.start, None])  # the energy of a lost node
-            values = run.columns._make(jnp.where(lost, jnp.nan, a) for a in columns)
-            return marked._replace(rows=values._replace(info=marked.rows[:, run.columns.info]))
+            nodes = _as_saved(run, saved.nodes, jnp.arange(self.num_saves + 1) * save_every)
+            return saved._replace(nodes=nodes).marked(replace(run, save_every=save_every))
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
 
@@ -183,16 +180,15 @@ def blank_memory(engine: Engine, shapes: tuple):
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
 
 
-def _as_saved(run, rows, steps):
-    """The columns of nodes after these numbers of macro steps, with projected momenta and `Observables`."""
-    *phase, info, micro = (rows[:, column] for column in run.columns[:-1])
+def _as_saved(run, nodes: Columns, steps) -> Columns:
+    """The nodes after these numbers of macro steps, with projected momenta and `Observables`."""
 
     def node(t, *phase):
         state, table = observed(run.system, State(t, *phase), run.solver.tolerance)
-        return *list(vars(state).values())[1:], table
+        return state.p_s, state.p_f, table
 
-    *phase, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *phase)
-    return *phase, info, micro, table
+    p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *nodes[:4])
+    return nodes._replace(p_s=p_s, p_f=p_f, table=table)
 
 
 def _row(state: State, worst: StepStatus, micro) -> Float[Numbers, "numbers"]:

@@ -26,7 +26,7 @@ RUN_AWAY = 20.0
 larger value the advice computes steps from positions that have already exploded."""
 
 
-class Motion(NamedTuple):
+class Move(NamedTuple):
     """How far a body, or a coordinate without a body, moves in a step, in a micro step if it is fast (`micro`).
 
     amount: radians for a turn; for a move the distance as a part of the extent of all positions.
@@ -64,8 +64,8 @@ class Motion(NamedTuple):
         )
 
 
-def largest_motion(system: System, state: State, names: Names | None, macro_dt: float, num_micro: int) -> Motion | None:
-    """The motion of largest `Motion.size` in the macro step H from a state; None where there are no coordinates or no
+def largest_motion(system: System, state: State, names: Names | None, macro_dt: float, num_micro: int) -> Move | None:
+    """The motion of largest `Move.size` in the macro step H from a state; None where there are no coordinates or no
     finite numbers.
 
     A rigid body turns by ``h |omega|`` with ``2 |omega|^2 = sum_i |dd_i/dt|^2`` over its three directors d_i.
@@ -85,13 +85,13 @@ def largest_motion(system: System, state: State, names: Names | None, macro_dt: 
             squares = np.sum(move[len(AXES) :].reshape(-1, len(AXES)) ** 2, axis=1)
             has_all_directors = len(squares) == len(AXES)  # a body of fewer directors turns by its fastest director
             turn = np.sqrt(squares.sum() / 2 if has_all_directors else squares.max(initial=0.0))
-            motions.append(Motion(name, micro, float(turn), True))
+            motions.append(Move(name, micro, float(turn), True))
             move = move[: len(AXES)]
         if name in known.numbered:  # coordinates without bodies: name the one that moves most
             fastest = int(np.abs(move).argmax())
             name, move = labels[place.part][place.start + fastest], move[fastest]
         if extent > 0:
-            motions.append(Motion(name, micro, float(np.linalg.norm(move) / extent), False))
+            motions.append(Move(name, micro, float(np.linalg.norm(move) / extent), False))
     return max((motion for motion in motions if np.isfinite(motion.amount)), key=lambda m: m.size, default=None)
 
 

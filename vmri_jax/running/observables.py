@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers, library
-from vmri_jax.mechanics.constraints import are_kept, residual_of, rows_at, weights_of
+from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.slopes import slopes_at, weights_of
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.steppers.results import Result
@@ -101,7 +102,10 @@ def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State,
     A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes
     mu, and not the motion: only momenta that are saved are projected. `tolerance` is of the solver.
     """
-    p_s, p_f, *velocities, masses = project_momentum(system, state)
+    slopes = slopes_at(system, state.t, state.q_s, state.q_f)
+    solved = sum(system.num_constraints(state.q_s, state.q_f))
+    constraints = slopes.jacobian[:solved], slopes.rates[:solved]
+    p_s, p_f, *velocities, masses = project_momentum(system, state, constraints=constraints)
     phase, v = (state.q_s, state.q_f, p_s, p_f), jnp.concatenate(velocities)
     parts = list(energy_parts(system, *phase, velocities, masses).values())
     if masses is None:
@@ -111,11 +115,8 @@ def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State,
         q, diagonal = jnp.concatenate([state.q_s, state.q_f]), jnp.diagonal(masses)
         kinetic, rounding = v @ masses @ v / 2, q @ masses @ q / 2
         volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
-    weights = weights_of(diagonal)
-    rows = rows_at(system, state.t, state.q_s, state.q_f, weights)
-    residual = residual_of(rows, system, state, weights * v)
-    kept = are_kept(rows, sum(system.num_constraints(state.q_s, state.q_f)), tolerance)
-    values = sum(parts), *residual, *kept, kinetic, sum(map(jnp.abs, parts)), rounding, volume
+    kept = are_kept(slopes.scaled(weights_of(diagonal)), solved, tolerance)
+    values = sum(parts), *slopes.residual(v), *kept, kinetic, sum(map(jnp.abs, parts)), rounding, volume
     return State(state.t, *phase), jnp.stack([jnp.asarray(value, dtype=float) for value in values])
 
 

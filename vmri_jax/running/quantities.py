@@ -152,7 +152,7 @@ class Quantities:
             ValueError: the run does not know its system, or did not keep the micro nodes.
         """
         self._check_concrete("multipliers")
-        values = at_nodes(_multipliers, self.origin, _states(self, micro))
+        values = at_nodes(motion, self.origin, _states(self, micro)).multipliers
         return {name: _shaped(self, values[..., rows], micro) for name, rows in self.names.rows.items()}
 
     def reaction_forces(self, constraint: str | None = None, micro: bool = False) -> dict:
@@ -321,7 +321,3 @@ def _velocity(system: System, state: State):
 def momenta_at(system: System, node: Nodes):
     """Momenta (p_s, p_f) of positions and velocities at a node."""
     return legendre(system, node.q_s, node.q_f, node.v_s, node.v_f)
-
-
-def _multipliers(system: System, state: State):
-    return motion(system, state).multipliers

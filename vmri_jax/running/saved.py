@@ -1,7 +1,7 @@
-"""Saved nodes of a run: rows of numbers with the same columns, and the status of the run.
+"""Saved nodes of a run: columns of numbers, and the status of the run.
 
 A program writes the numbers of a node as one row into one array: XLA on CPU would take longer for one write into each
-column.
+column. Derivatives go column by column: the derivative of positions then has no part of that of the observables.
 """
 
 from itertools import accumulate, pairwise
@@ -24,7 +24,7 @@ short run. With a larger value more runs may fill a small machine."""
 
 
 class Columns(NamedTuple):
-    """The columns of a row.
+    """The columns of nodes as arrays, or their slices of a row.
 
     q_s, q_f, p_s, p_f: positions and momenta, as of a `State`.
     info: `RunInfo` of the steps since the node before.
@@ -32,13 +32,13 @@ class Columns(NamedTuple):
     table: `Observables` of the state.
     """
 
-    q_s: slice
-    q_f: slice
-    p_s: slice
-    p_f: slice
-    info: slice
-    micro: slice
-    table: slice
+    q_s: Any
+    q_f: Any
+    p_s: Any
+    p_f: Any
+    info: Any
+    micro: Any
+    table: Any
 
     @classmethod
     def of(cls, state: State, num_micro: int) -> "Columns":
@@ -48,16 +48,22 @@ class Columns(NamedTuple):
         sizes = n_s, n_f, n_s, n_f, len(RunInfo._fields), num_micro * n_f, len(Observables._fields)
         return cls(*(slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))))
 
+    def split(self, rows) -> "Columns":
+        """The arrays of rows (..., numbers) with these slices."""
+        return Columns(*(rows[..., column] for column in self))
+
 
 class Saved(NamedTuple):
-    """Nodes of a run, a row for each, and its status; of JAX or NumPy; in a batch with lanes.
+    """Nodes of a run and its status; of JAX or NumPy; in a batch with lanes."""
 
-    rows: an array, or of a run under a transformation its columns.
-    """
-
-    rows: Any
+    nodes: Columns
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
+
+    @property
+    def method(self):
+        """The largest `Method` of the steps."""
+        return self.nodes.info[..., 0].max(axis=-1)
 
     def marked(self, run: Any, step: int = 0) -> "Saved":
         """The nodes of a `Simulation`, NaN from a failure on; a node that cannot be right, see `is_right`, is a
@@ -65,8 +71,8 @@ class Saved(NamedTuple):
 
         Nodes after a failed step may have any numbers. There are `step` macro steps before the first node.
         """
-        rows, result, failed_at = self
-        module, now = library(rows), Observables.of(rows[..., run.columns.table])
+        nodes, result, failed_at = self
+        module, now = library(nodes.table), Observables.of(nodes.table)
         right = is_right(now)
         # a prepared run is called many times, and an operation of JAX takes as long as many steps
         if module is np and right.all() and (failed_at < 0).all():
@@ -77,17 +83,15 @@ class Saved(NamedTuple):
         cause = module.take_along_axis(fault(now), node[..., None], -1)[..., 0]
         lost = number >= module.where(breaks, node, after_step)[..., None, None]
         unreached = number > module.where(breaks, len(number), after_step)[..., None, None]
-        is_info = np.isin(np.arange(rows.shape[-1]), np.r_[run.columns.info])
-        rows = module.where(module.where(is_info, unreached, lost), np.where(is_info, 0.0, np.nan), rows)
+        info = module.where(unreached, 0.0, nodes.info)
+        nodes = Columns(*(module.where(lost, np.nan, column) for column in nodes))._replace(info=info)
         failed_here = step + module.maximum(node * run.save_every - 1, 0)
-        return Saved(rows, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
+        return Saved(nodes, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
         """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a
         number of macro steps."""
-        rows = self.rows
-        columns = rows if isinstance(rows, tuple) else [rows[..., column] for column in run.columns]
-        *phase, info, q_f_micro, table = columns
+        *phase, info, q_f_micro, table = self.nodes
         t_start, macro_dt = (np.asarray(a) if is_concrete(a) else a for a in (run.state.t, run.macro_dt))
         t = t_start[..., None] + (step + np.arange(table.shape[-2]) * run.save_every) * macro_dt[..., None]
         states, micro = State(t, *phase), None
@@ -107,8 +111,9 @@ def joined(pieces: list[Saved]) -> Saved:
     before it."""
     if len(pieces) == 1:
         return pieces[0]
-    rows = [piece.rows[min(i, 1) :] for i, piece in enumerate(pieces)]
-    return pieces[-1]._replace(rows=np.concatenate(rows))
+    columns = zip(*(piece.nodes for piece in pieces), strict=True)
+    joined = ([a[min(i, 1) :] for i, a in enumerate(parts)] for parts in columns)
+    return pieces[-1]._replace(nodes=Columns(*map(np.concatenate, joined)))
 
 
 def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = None) -> None:

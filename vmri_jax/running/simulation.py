@@ -169,7 +169,7 @@ class Simulation:
     def _whole(self) -> Saved:
         """The run by one program, without the fallback."""
         rows, status = map(np.asarray, self.engine.program(self.leaves, self.save_every, self.num_saves))
-        return Saved(rows[: self.num_saves + 1], *status).marked(self)
+        return Saved(self.columns.split(rows[: self.num_saves + 1]), *status).marked(self)
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
@@ -178,7 +178,7 @@ class Simulation:
             return lambda leaves: run.engine.differentiable(leaves, run.save_every)
 
         def failed(saved: Saved):
-            return unsolved(saved.result, self._method(saved))
+            return unsolved(saved.result, saved.method)
 
         run = steps(self)
         if self.plan.has_fallback:
@@ -193,14 +193,10 @@ class Simulation:
         trajectory = saved.trajectory(self)
         if not is_told:
             self.tell_of_start(caller, trajectory)
-        self.warn(caller, self.table(saved), trajectory.states.t)
+        self.warn(caller, saved.nodes.table, trajectory.states.t)
         if throw and trajectory.failed_at >= 0:
             raise simulation_error(self, trajectory)
         return trajectory
-
-    def table(self, saved: Saved) -> np.ndarray:
-        """The `Observables` of its nodes."""
-        return saved.rows[..., self.columns.table]
 
     def tell_of_start(self, caller: str, trajectory: Trajectory) -> None:
         """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, which
@@ -243,7 +239,7 @@ class Simulation:
 
     @cached_property
     def columns(self) -> Columns:
-        """The columns of its saved nodes."""
+        """The columns of a row of its saved nodes."""
         return Columns.of(self.state, self.scheme.num_micro if self.save.micro else 0)
 
     @property
@@ -322,7 +318,9 @@ class Simulation:
             cursor = cursor._replace(memory=self.blank_memory)
         rows, cursor = self._pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
-        saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at)).marked(self, step)
+        saved = Saved(self.columns.split(nodes), np.asarray(cursor.result), np.asarray(cursor.failed_at)).marked(
+            self, step
+        )
         reached = np.asarray(step + saves * self.save_every)
         return saved, cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
 
@@ -331,11 +329,7 @@ class Simulation:
         is_alive = np.asarray(saved.failed_at < 0)
         if is_alive.all() or not (self.may_fall_back and self.plan.has_fallback):
             return np.zeros(is_alive.shape, dtype=bool)
-        return unsolved(saved.result, self._method(saved))
-
-    def _method(self, saved: Saved):
-        """The largest `Method` of the steps."""
-        return saved.rows[..., self.columns.info.start].max(axis=-1)
+        return unsolved(saved.result, saved.method)
 
     def in_pieces(self) -> Saved:
         """The nodes of the whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so

@@ -14,9 +14,10 @@ from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.checks import describe, shape_of
-from vmri_jax.mechanics.constraints import START, Rows
+from vmri_jax.mechanics.constraints import START
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.slopes import ScaledRows, Slopes
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES, Bindable
 from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving, weights_of
@@ -269,11 +270,11 @@ def check_function(effect: Any, moved: bool) -> None:
                 )
 
 
-def _rows(constraint, *arguments) -> Rows:
-    """The `Rows` of a constraint of positions, its last argument but one."""
+def _rows(constraint, *arguments) -> ScaledRows:
+    """The `ScaledRows` of a constraint of positions, its last argument but one."""
     *before, q, params = arguments
     flat, by_role = ravel_pytree(q)
-    return Rows.of(lambda flat: jnp.ravel(constraint(*before, by_role(flat), params)), flat)
+    return Slopes.of(lambda flat: jnp.ravel(constraint(*before, by_role(flat), params)), flat).scaled(weights=1.0)
 
 
 def _check_value(effect: Any, value: Any, sizes: list[tuple[int, ...]], count: int) -> None:

@@ -126,20 +126,20 @@ class Sum:
         return tuple(term for term in self.terms if term.start is not None or term.end is not None)
 
 
-class Placed(NamedTuple):
+class PlacedTerm(NamedTuple):
     """A term of a system with the rule that a scheme gives it."""
 
     term: Term
     rule: PlacedRule
 
 
-def placed_potentials(system: System, scheme: Scheme) -> tuple[Placed, ...]:
+def placed_potentials(system: System, scheme: Scheme) -> tuple[PlacedTerm, ...]:
     """All potentials of a system with the rules that a scheme gives them.
 
     Raises:
         ValueError: a potential without a rule.
     """
-    return tuple(Placed(term, scheme.rule_of(term.name)) for term in system.of_kind("potential"))
+    return tuple(PlacedTerm(term, scheme.rule_of(term.name)) for term in system.of_kind("potential"))
 
 
 def lagrangian(system: System, scheme: Scheme) -> Sum:

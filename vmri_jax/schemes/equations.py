@@ -32,7 +32,7 @@ from vmri_jax.mechanics.arrays import Number, Numbers
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.path import Nodes, control_nodes, lagrange_basis, velocity_nodes
+from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.schemes.scheme import Scheme
 
 LEAST_SUM = 0.2
@@ -88,11 +88,6 @@ class StepEquations(eqx.Module):
     def micro_dt(self):
         """Length h of a micro interval."""
         return self.macro_dt / self.scheme.num_micro
-
-    @property
-    def force_nodes(self) -> Nodes:
-        """Where forces are evaluated."""
-        return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
 
     def mass_diagonal(self):
         """Diagonals (n_s,) and (n_f,) of the constant masses, or of `masses`."""

@@ -31,7 +31,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from vmri_jax.kernels import matmul, matvec
@@ -39,21 +38,8 @@ from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.structure import entries_seen
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
-from vmri_jax.schemes.path import Nodes, control_nodes, lagrange_basis, lagrange_derivative
-
-
-class IntervalPath(NamedTuple):
-    """The path over one micro interval, with the n_v slow variables on which terms in the interval depend, see
-    `Intervals`.
-
-    slow_start, slow: start and increments of the slow control points, of the whole macro step.
-    fast_start, fast: start and increments of the fast control points of this interval.
-    """
-
-    slow_start: Float[Array, "n_v"]
-    slow: Float[Array, "r n_v"]
-    fast_start: Float[Array, "n_f"]
-    fast: Float[Array, "r n_f"]
+from vmri_jax.schemes.interval_nodes import IntervalNodes, IntervalPath, of_interval, with_unseen
+from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative, velocity_nodes
 
 
 class Arriving(NamedTuple):
@@ -75,86 +61,6 @@ class IntervalUnknowns(NamedTuple):
 
     fast: Float[Array, "r n_f"]
     multiplier: Float[Array, "r n_g"]
-
-
-class IntervalNodes:
-    """Quadrature nodes of a term, the same number in every micro interval that has nodes.
-
-    Args:
-        nodes: of the term.
-        rows: numbers of some of them; a row has at most one node in each interval.
-    """
-
-    def __init__(self, nodes: Nodes, rows: list[np.ndarray]):
-        n, r = nodes.num_micro, nodes.degree
-        c, of = np.zeros((n, len(rows))), np.full((n, len(rows)), -1)
-        for k, row in enumerate(rows):
-            c[nodes.interval[row], k], of[nodes.interval[row], k] = nodes.c[row], nodes.of[row]
-        self.has_nodes: np.ndarray = np.any(of >= 0, axis=1)
-        if (of == of[0]).all():
-            self.weights = nodes.distinct[of[:1]]  # of all intervals
-        else:
-            self.weights = jnp.append(nodes.distinct, 0.0)[of]
-        self.c, self.theta = c, (np.arange(n)[:, None] + c) / n
-        self.tables = {
-            "q_s": lagrange_basis(r, self.theta)[..., 1:],
-            "v_s": lagrange_derivative(r, self.theta)[..., 1:],
-            "q_f": lagrange_basis(r, c)[..., 1:],
-            "v_f": lagrange_derivative(r, c)[..., 1:],
-        }
-
-    @classmethod
-    def of(cls, nodes: Nodes) -> "list[IntervalNodes]":
-        """The nodes of a rule: one entry for all rows with a node in every interval, and one for each other row.
-
-        So functions are evaluated at the nodes of their rule alone: a potential may not be defined elsewhere, and a
-        rule on the macro step has no node in most intervals.
-        """
-        # row k has the nodes that are the k-th of their interval
-        k = [np.sum(nodes.interval[:i] == m) for i, m in enumerate(nodes.interval)]
-        rows = [np.flatnonzero(np.equal(k, number)) for number in range(max(k, default=-1) + 1)]
-        everywhere = [row for row in rows if len(row) == nodes.num_micro]
-        parts = [everywhere] if everywhere else []
-        parts += [[row] for row in rows if len(row) < nodes.num_micro]
-        return [cls(nodes, part) for part in parts]
-
-    def sample(self, path: IntervalPath, equations: StepEquations, seen: Entries, m, names: tuple[str, ...]) -> list:
-        """Values of the path at the k nodes of interval m, by name: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``,
-        ``v_f`` (k, n).
-
-        Slow variables on which no term depends have their values at the start of the macro step.
-        """
-
-        def values_at_nodes(name: str):
-            if name == "t":
-                return equations.t + equations.macro_dt * of_interval(self.theta, m)
-            start, increments = (path.slow_start, path.slow) if name[2] == "s" else (path.fast_start, path.fast)
-            table = of_interval(self.tables[name], m)
-            is_start = isinstance(table, np.ndarray) and not table.any()  # there JAX has to know that nothing moves
-            moved = jnp.zeros((len(table), start.size)) if is_start else matmul(table, increments)
-            # q(c) = q_0 + sum_j l_j(c) Delta_j,  v(c) = sum_j l_j'(c) Delta_j / T, with T = H for slow and T = h for
-            # fast variables
-            if name[0] == "q":
-                values = start + moved
-            else:
-                values = moved / (equations.macro_dt if name[2] == "s" else equations.micro_dt)
-            return with_unseen(values, name, equations, seen) if name[2] == "s" else values
-
-        return [values_at_nodes(name) for name in names]
-
-
-def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
-    """All slow positions or velocities (k, n_s), "q_s" or "v_s", from the seen ones (k, n_v); the others stay at rest
-    at the start."""
-    at_rest = equations.q_s if name == "q_s" else jnp.zeros_like(equations.q_s)
-    return seen.put(values, jnp.broadcast_to(at_rest, (len(values), at_rest.size)))
-
-
-def of_interval(table, m):
-    """The rows of a table for interval m; a constant, without a lookup, if the rows of all intervals are equal."""
-    if len(table) == 1 or (isinstance(table, np.ndarray) and np.ptp(table, axis=0).max(initial=0.0) == 0.0):
-        return table[0]
-    return jnp.asarray(table)[m]
 
 
 class Intervals:
@@ -179,10 +85,9 @@ class Intervals:
         self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
         of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
         self.terms = [(term, nodes) for term in of_fast for nodes in IntervalNodes.of(term.inside)]
-        has_force = equations.system.force is not None
-        self._force_nodes = IntervalNodes.of(equations.force_nodes) if has_force else []
+        n, r, has_force = equations.scheme.num_micro, equations.scheme.degree, equations.system.force is not None
+        self._force_nodes = IntervalNodes.of(velocity_nodes(equations.scheme.force, n, r)) if has_force else []
         self.seen = self._seen()
-        n, r = equations.scheme.num_micro, equations.scheme.degree
         self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
 
     def by_masses(self) -> "Intervals":
@@ -308,9 +213,9 @@ class Intervals:
         along `held` on displacements of `path`."""
         total = jnp.zeros(())
         for term, nodes in self.terms:
-            total += _where_there_are_nodes(nodes, m, partial(self._of_term, term, nodes, m), path)
+            total += nodes.evaluated(m, partial(self._of_term, term, nodes, m), path)
         for nodes in self._force_nodes:
-            total += _where_there_are_nodes(nodes, m, partial(self._virtual_work, nodes, m), path, held)
+            total += nodes.evaluated(m, partial(self._virtual_work, nodes, m), path, held)
         return self.equations.micro_dt * total
 
     def _of_term(self, term: TermOnNodes, nodes: IntervalNodes, m, path: IntervalPath):
@@ -403,12 +308,3 @@ def _quadratic_form(matrix) -> Callable:
         return v[0] @ row / 2, row @ dv[0]
 
     return energy
-
-
-def _where_there_are_nodes(nodes: IntervalNodes, m, function, *paths):
-    """``function(*paths)``, or zero without evaluation in intervals where the rule has no nodes."""
-    if nodes.has_nodes.all():
-        return function(*paths)
-    if isinstance(m, int):
-        return function(*paths) if nodes.has_nodes[m] else jnp.zeros(())
-    return jax.lax.cond(jnp.asarray(nodes.has_nodes)[m], function, lambda *_: jnp.zeros(()), *paths)

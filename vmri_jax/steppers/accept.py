@@ -108,7 +108,7 @@ class Accepted(NamedTuple):
     constraints: Number = 0.0
 
     @classmethod
-    def of(cls, equations: StepEquations, newton, weights: Weights = NO_WEIGHTS) -> "Accepted":
+    def of(cls, equations: StepEquations, settings, weights: Weights = NO_WEIGHTS) -> "Accepted":
         """The accepted corrections of a step, from the positions at its start, with the weights of corrections."""
         slow, fast = weights.largest(equations.q_s, equations.q_f)
         largest = jnp.maximum(slow, fast)
@@ -116,7 +116,7 @@ class Accepted(NamedTuple):
         tied = (largest, largest) if equations.system.constraint is not None else (slow, fast)
         floors = jnp.stack([slow, tied[0]]), jnp.stack([fast, tied[1]]), largest
         roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in floors)
-        return cls(newton.tolerance / SAFETY, *roundoff)
+        return cls(settings.tolerance / SAFETY, *roundoff)
 
     def at_floor(self, size, before, floor=FLOOR):
         """Whether corrections no longer shrink, from `before` to `size`, and are round-off, see `is_roundoff`. With

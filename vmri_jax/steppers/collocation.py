@@ -268,22 +268,22 @@ class Collocation(StepSolver):
     """Newton steps until the next one would change no increment (`Accepted`); its correction is extrapolated from the
     last two.
 
-    newton: settings.
+    settings: of the iteration.
     num_slow: of `IntervalEquations`.
     """
 
-    newton: Solver
+    settings: Solver
     num_slow: int
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: tuple) -> tuple[Solution, tuple]:
-        newton, interval, modes = (
-            self.newton,
+        settings, interval, modes = (
+            self.settings,
             IntervalEquations(equations, self.num_slow),
             TimeModes.of(equations.scheme),
         )
         x, mu = guess.fast[0].T, guess.multiplier[0].T
         saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
-        accepted = Accepted.of(equations, newton)
+        accepted = Accepted.of(equations, settings)
 
         def corrected(last: Increments, forces: Forces) -> Increments:
             # (A (x) M)^-1 R. Its equal x + M^-1 forces A^-T has the round-off of A^-1 in every step, always the same.
@@ -291,7 +291,7 @@ class Collocation(StepSolver):
             dx, dmu = saddles.solve(-residual, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, max_abs(dx), last.iterations + 1
             ratio = accepted.ratio((0.0, expected(moved, last.moved)), (0.0, max_abs(x)), iterations)
-            result = newton.status(ratio, iterations)
+            result = settings.status(ratio, iterations)
             return Increments(x, mu, moved, iterations, result)
 
         def step(iterate: Evaluated) -> Evaluated:

@@ -12,7 +12,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
-class ComposedState(NamedTuple):
+class ComposedMemory(NamedTuple):
     """Memory of a composition.
 
     last: memory of the last stage.
@@ -34,11 +34,11 @@ class Composed(Stepper):
     coefficients: Float[Numbers, "s"]
     stage: Stepper
 
-    def init(self, state: State, macro_dt) -> ComposedState:
+    def init(self, state: State, macro_dt) -> ComposedMemory:
         stages = jax.vmap(lambda c: self.stage.init(state, c * macro_dt))(jnp.asarray(self.coefficients))
-        return ComposedState(jax.tree.map(lambda a: a[0], stages), stages)
+        return ComposedMemory(jax.tree.map(lambda a: a[0], stages), stages)
 
-    def advance(self, state: State, memory: ComposedState, macro_dt) -> tuple[State, StepInfo, ComposedState]:
+    def advance(self, state: State, memory: ComposedMemory, macro_dt) -> tuple[State, StepInfo, ComposedMemory]:
         def stage(carry, coefficient_and_memory):
             (state, last), (c, memory) = carry, coefficient_and_memory
             memory = self.stage.continued(memory, last, state, c * macro_dt)
@@ -50,7 +50,7 @@ class Composed(Stepper):
         (state, last), (stage_memories, infos) = jax.lax.scan(stage, (state, memory.last), stages)
         worst = jax.tree.map(jnp.max, infos.status)
         along = map(jnp.concatenate, (infos.q_f_micro, infos.multiplier, infos.slow_multiplier))
-        return state, StepInfo(*worst, *along), ComposedState(last, stage_memories)
+        return state, StepInfo(*worst, *along), ComposedMemory(last, stage_memories)
 
     def describe(self) -> list[str]:
         return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.describe())]

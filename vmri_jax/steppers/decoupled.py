@@ -14,7 +14,7 @@ from vmri_jax.steppers.kicked import Kicked, steps_in_words
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
-class DecoupledState(NamedTuple):
+class DecoupledMemory(NamedTuple):
     """Memories of the steppers of the slow and of the fast variables."""
 
     slow: Any
@@ -37,22 +37,24 @@ class Decoupled(Stepper):
     fast: Kicked
     num_fast: int
 
-    def init(self, state: State, macro_dt) -> DecoupledState:
+    def init(self, state: State, macro_dt) -> DecoupledMemory:
         slow, fast = apart(state)
-        return DecoupledState(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt / self.num_fast))
+        return DecoupledMemory(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt / self.num_fast))
 
-    def advance(self, state: State, memory: DecoupledState, macro_dt) -> tuple[State, StepInfo, DecoupledState]:
+    def advance(self, state: State, memory: DecoupledMemory, macro_dt) -> tuple[State, StepInfo, DecoupledMemory]:
         slow, fast = apart(state)
         slow, slow_info, slow_memory = self.slow.advance(slow, memory.slow, macro_dt)
-        fast, info, fast_memory = self.fast.advance_many(fast, memory.fast, macro_dt / self.num_fast, self.num_fast)
+        micro_dt = macro_dt / self.num_fast
+        renewed = self.fast.renew(fast, memory.fast, micro_dt)
+        fast, info, fast_memory = self.fast.advance_many(fast, renewed, micro_dt, self.num_fast)
         status = slow_info.status.worse(info.status)
         end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
         info = StepInfo(*status, info.q_f_micro, info.multiplier, slow_info.multiplier[0])
-        return end, info, DecoupledState(slow_memory, fast_memory)
+        return end, info, DecoupledMemory(slow_memory, fast_memory)
 
-    def continued(self, memory: DecoupledState, last: DecoupledState, state: State, macro_dt) -> DecoupledState:
+    def continued(self, memory: DecoupledMemory, last: DecoupledMemory, state: State, macro_dt) -> DecoupledMemory:
         slow, fast = apart(state)
-        return DecoupledState(
+        return DecoupledMemory(
             self.slow.continued(memory.slow, last.slow, slow, macro_dt),
             self.fast.continued(memory.fast, last.fast, fast, macro_dt / self.num_fast),
         )

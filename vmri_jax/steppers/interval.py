@@ -34,7 +34,8 @@ from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hess
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations
-from vmri_jax.schemes.intervals import IntervalPath, Intervals, of_interval
+from vmri_jax.schemes.interval_nodes import IntervalPath, of_interval
+from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.schemes.scheme import Scheme
 

@@ -16,7 +16,7 @@ from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus, indented
 
 
-class KickedState(NamedTuple):
+class KickedMemory(NamedTuple):
     """Memory that a step hands to the next one.
 
     gradients: ``(dL/dq_s, dL/dq_f)`` of every kick at the node that two steps share.
@@ -43,38 +43,32 @@ class Kicked(Stepper):
     inner: Stepper
     average: Callable | None = None
 
-    def init(self, state: State, macro_dt) -> KickedState:
-        return KickedState(self._gradients(state, macro_dt), self.inner.init(state, macro_dt))
+    def init(self, state: State, macro_dt) -> KickedMemory:
+        return KickedMemory(self._gradients(state, macro_dt), self.inner.init(state, macro_dt))
 
-    def renew(self, state: State, memory: KickedState, macro_dt) -> KickedState:
+    def renew(self, state: State, memory: KickedMemory, macro_dt) -> KickedMemory:
         return memory._replace(inner=self.inner.renew(state, memory.inner, macro_dt))
 
-    def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
+    def advance(self, state: State, memory: KickedMemory, macro_dt) -> tuple[State, StepInfo, KickedMemory]:
         inner = self.inner.renew(state, memory.inner, macro_dt)
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
         end, info, inner = self.inner.advance(state, inner, macro_dt)
         state = replace(end, t=state.t + macro_dt)  # whatever time a stepper of the user returns
         gradients = self._gradients(state, macro_dt)
-        memory = KickedState(gradients, inner)
+        memory = KickedMemory(gradients, inner)
         state = kicked(state, self.kicks, gradients, macro_dt, end=1.0)
         return state, info, memory
 
     def advance_many(
-        self, state: State, memory: KickedState, macro_dt, count: int
-    ) -> tuple[State, StepInfo, KickedState]:
-        """`count` steps with the same matrices; the two kicks at a node that two steps share are one."""
-        return self.advance_with_matrices(state, self.renew(state, memory, macro_dt), macro_dt, count)
-
-    def advance_with_matrices(
-        self, state: State, memory: KickedState, macro_dt, count: int
-    ) -> tuple[State, StepInfo, KickedState]:
-        """`count` steps with the matrices in `memory`."""
+        self, state: State, memory: KickedMemory, macro_dt, count: int
+    ) -> tuple[State, StepInfo, KickedMemory]:
+        """`count` steps with the matrices in `memory`; the two kicks at a node that two steps share are one."""
 
         def step(state, inner, start: float):
             state, info, inner = self.inner.advance(state, inner, macro_dt)
             gradients = self._gradients(state, macro_dt)
             state = kicked(state, self.kicks, gradients, macro_dt, start=start, end=1.0)
-            return state, info, KickedState(gradients, inner)
+            return state, info, KickedMemory(gradients, inner)
 
         def between(carry, _):
             state, inner, worst = carry
@@ -93,9 +87,9 @@ class Kicked(Stepper):
         q_f, multiplier = _all_steps(q_f, last.q_f_micro), _all_steps(multiplier, last.multiplier)
         return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
 
-    def continued(self, memory: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
+    def continued(self, memory: KickedMemory, last: KickedMemory, state: State, macro_dt) -> KickedMemory:
         gradients = last.gradients if self.average is None else self._gradients(state, macro_dt)
-        return KickedState(gradients, self.inner.continued(memory.inner, last.inner, state, macro_dt))
+        return KickedMemory(gradients, self.inner.continued(memory.inner, last.inner, state, macro_dt))
 
     def _gradients(self, state: State, macro_dt):
         q_s, q_f = state.q_s, state.q_f
@@ -130,16 +124,16 @@ class Repeated(Stepper):
     inner: Kicked
     count: int
 
-    def init(self, state: State, macro_dt) -> KickedState:
+    def init(self, state: State, macro_dt) -> KickedMemory:
         return self.inner.init(state, macro_dt / self.count)
 
-    def renew(self, state: State, memory: KickedState, macro_dt) -> KickedState:
+    def renew(self, state: State, memory: KickedMemory, macro_dt) -> KickedMemory:
         return self.inner.renew(state, memory, macro_dt / self.count)
 
-    def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
-        return self.inner.advance_with_matrices(state, memory, macro_dt / self.count, self.count)
+    def advance(self, state: State, memory: KickedMemory, macro_dt) -> tuple[State, StepInfo, KickedMemory]:
+        return self.inner.advance_many(state, memory, macro_dt / self.count, self.count)
 
-    def continued(self, memory: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
+    def continued(self, memory: KickedMemory, last: KickedMemory, state: State, macro_dt) -> KickedMemory:
         return self.inner.continued(memory, last, state, macro_dt / self.count)
 
     def describe(self) -> list[str]:
@@ -189,7 +183,7 @@ def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
     def averaged(macro_dt, q_s, q_f):
         stepper, micro_dt, none = stepper_of(q_s, q_f), macro_dt / num_micro, jnp.zeros(0)
         start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
-        memory = stepper.init(start, micro_dt)
+        memory = stepper.renew(start, stepper.init(start, micro_dt), micro_dt)
         _, info, _ = stepper.advance_many(start, memory, micro_dt, num_micro)
         x = info.q_f_micro
         a = (q_f / 2 + jnp.sum(x[:-1], axis=0) + x[-1] / 2) / num_micro

@@ -35,18 +35,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs
-from vmri_jax.kernels.saddle import saddle
+from vmri_jax.kernels import matmul, matvec, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights, largest
+from vmri_jax.steppers.null_space import inverse_with_multipliers
 
 
 class Matrices(NamedTuple):
     """The matrices, which passes keep: k unknowns of an interval, r n_v slow increments that it sees.
 
     inverse: ``(dR/dx)^-1`` of the residual R of an interval by its unknowns x.
-    hands_on: derivative of the o gradients that are handed on (`Handed`) by these unknowns.
+    hands_on: derivative of the o gradients that are handed on (`FlatArriving`) by these unknowns.
     response: ``dx_m/dz``, for the slow increments that intervals see.
     slow: ``S^-1``, the inverse of the slow equations after elimination of the intervals.
     """
@@ -57,9 +57,8 @@ class Matrices(NamedTuple):
     slow: Float[Array, "b b"]
 
 
-class Handed(NamedTuple):
-    """The quantities that arrive at an interval, as vectors, or their derivatives, as matrices with one column for each
-    direction.
+class FlatArriving(NamedTuple):
+    """`Arriving` as two vectors, or their derivatives, as matrices with one column for each direction.
 
     position: q_f.
     gradients: of h times the action of the intervals before: by q_f (the momentum ``h p_f``), by the start of the slow
@@ -79,12 +78,12 @@ class MarchEquations:
         weights: of the variables, for the sizes of corrections and residuals.
     """
 
-    def __init__(self, equations: StepEquations, inverted=None, weights: Weights = NO_WEIGHTS):
+    def __init__(self, equations: StepEquations, inverted=inverse_with_multipliers, weights: Weights = NO_WEIGHTS):
         self.equations, self.intervals = equations, Intervals(equations)
         self.weights = weights
         self.of_increments = Weights(*(w if w is None else jnp.tile(w, equations.scheme.degree) for w in weights))
         self.of_momenta = self.of_increments.of_momenta()
-        self.inverted = inverted or inverse_with_multipliers
+        self.inverted = inverted
         self.n, self.r = equations.scheme.num_micro, equations.scheme.degree
         self.n_s, self.n_f = equations.q_s.size, equations.q_f.size
         self.n_g, self.n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
@@ -133,10 +132,10 @@ class MarchEquations:
         """(r n_v,) the slow increments in z that intervals see."""
         return self.intervals.seen.take(z[: self.num_slow].reshape(self.r, self.n_s)).reshape(self.num_seen)
 
-    def start(self) -> Handed:
+    def start(self) -> FlatArriving:
         """The fast position and momentum at the start of the step; no interval has pushed the slow path yet."""
         start = self.intervals.start()
-        return Handed(start.q_f, _gradients(start))
+        return FlatArriving(start.q_f, _gradients(start))
 
     def no_matrices(self) -> Matrices:
         """Matrices of zeros, for their shapes."""
@@ -144,7 +143,7 @@ class MarchEquations:
         b = self.num_slow + self.r * self.n_gs
         return Matrices(*map(jnp.zeros, ((n, k, k), (n, o, k), (n, k, self.num_seen), (b, b))))
 
-    def interval(self, m, x, arriving: Handed, slow):
+    def interval(self, m, x, arriving: FlatArriving, slow):
         """Residual (k,) of interval m, and the gradients (o,) that it hands on."""
         residual, on = self.intervals.evaluate(m, self._named(x), self._apart(arriving), self._by_node(slow))
         rows = jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)])
@@ -157,18 +156,18 @@ class MarchEquations:
     def _by_node(self, slow):
         return slow.reshape(self.r, self.n_v)
 
-    def slow_equations(self, z, arriving: Handed):
+    def slow_equations(self, z, arriving: FlatArriving):
         """Residual (b,) of the slow equations, and the slow momentum at the end."""
         slow, multiplier = z[: self.num_slow].reshape(self.r, self.n_s), z[self.num_slow :].reshape(self.r, self.n_gs)
         impulses = self.intervals.slow_impulses(slow, multiplier)
         rows, p_s = self.intervals.slow_rows(slow, impulses, self._apart(arriving))
         return jnp.concatenate([rows.reshape(-1), self.intervals.slow_constraints(slow).reshape(-1)]), p_s
 
-    def _apart(self, arriving: Handed) -> Arriving:
+    def _apart(self, arriving: FlatArriving) -> Arriving:
         p_f, start, slow = jnp.split(arriving.gradients, [self.n_f, self.n_f + self.n_v])
         return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_v))
 
-    def slow_inverse(self, z, arriving: Handed, sensitivities: Handed):
+    def slow_inverse(self, z, arriving: FlatArriving, sensitivities: FlatArriving):
         """The inverse (b, b) of the total derivative S of the slow residual, and `slow_equations`, whose values it
         shares.
 
@@ -198,7 +197,9 @@ class MarchEquations:
         """The fast increment (n_f, ...) from the start of the interval to its end, out of the unknowns (k, ...)."""
         return x[self.num_fast - self.n_f : self.num_fast]
 
-    def corrected(self, m, matrices, x, slow, arriving: Handed, values, worst: "Worst") -> tuple[Any, Handed, "Worst"]:
+    def corrected(
+        self, m, matrices, x, slow, arriving: FlatArriving, values, worst: "Worst"
+    ) -> tuple[Any, FlatArriving, "Worst"]:
         """Interval m after the correction ``d = -(dR/dx)^-1 R``: x + d, its end position and gradients, corrected to
         first order, and the maxima.
 
@@ -219,9 +220,9 @@ class MarchEquations:
             named = self._named(x), self._apart(arriving), self._by_node(slow)
             gradients += _gradients(self.intervals.impulses(m, *named, dmu))
         worst = worst.add(residual, d, largest(residual[:n], self.of_momenta.fast), self.fast_size(d))
-        return x + d, Handed(arriving.position + self.last_increment(x + d), gradients), worst
+        return x + d, FlatArriving(arriving.position + self.last_increment(x + d), gradients), worst
 
-    def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, slow_values) -> "Passed":
+    def passed(self, matrices: Matrices, z, x, worst: "Worst", end: FlatArriving, slow_values) -> "Passed":
         """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``.
 
         The returned z and p_s contain the correction of the slow multipliers already, dz the correction of the
@@ -251,12 +252,6 @@ class MarchEquations:
 def _gradients(on: Arriving):
     """(o,) the gradients in one vector."""
     return jnp.concatenate([on.p_f, on.start, on.slow.reshape(-1)])
-
-
-def inverse_with_multipliers(a, b, c, nodes: int):
-    """The inverse of ``[[A, B], [C, 0]]`` by elimination, regularised for dependent constraints
-    (`vmri_jax.kernels.saddle`)."""
-    return inverse_in_loop(saddle(a, b, c) if b.shape[-1] else a)
 
 
 class Worst(NamedTuple):
@@ -300,7 +295,7 @@ class Passed(NamedTuple):
     x: Float[Array, "num_micro k"]
     dz: Float[Array, "b"]
     dx: Float[Array, "num_micro k"]
-    end: Handed
+    end: FlatArriving
     p_s: Float[Array, "n_s"]
     worst: Worst
 
@@ -320,7 +315,7 @@ def linearised_pass(
 
     Returns:
         The matrices, the pass, and the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every
-        interval and of the gradients that it hands on, with respect to the position that arrives: `solve` needs them.
+        interval and of the gradients that it hands on, with respect to the position that arrives, for `implicit.solve`.
     """
     slow, unit, n_f = march.seen(z), jnp.eye(march.num_seen), march.n_f
 
@@ -343,17 +338,17 @@ def linearised_pass(
         inverse = march.inverse(by_x, march.num_fast)
         # dx_m/dz = -(dR_m/dx_m)^-1 dR_m/dz, with the dependence of the arriving quantities on z inside dR_m/dz
         response = -matmul(inverse, by_z)
-        sensitivities = Handed(
+        sensitivities = FlatArriving(
             sensitivities.position + march.last_increment(response), hands_on_by_z + matmul(hands_on, response)
         )
         if corrects:
             x, on, worst = march.corrected(m, (inverse, hands_on), x, slow, arriving, values, worst)
         else:
-            on = Handed(arriving.position + march.last_increment(x), values[1])
+            on = FlatArriving(arriving.position + march.last_increment(x), values[1])
         return (on, sensitivities, x, worst), (x, inverse, hands_on, response, by_position, hands_on_by_position)
 
     start = march.start()
-    none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
+    none = FlatArriving(*(jnp.zeros((a.size, march.num_seen)) for a in start))
     carry = start, none, last, Worst.none()
     (end, sensitivities, _, worst), stacked = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
     x, inverse, hands_on, response, *by_positions = stacked
@@ -380,32 +375,3 @@ def kept_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) 
     intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
     (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)
     return march.passed(matrices, z, x, worst, end, march.slow_equations(z, end))
-
-
-def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x):
-    """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and JAX can transpose it.
-
-    Forward elimination with z fixed, then ``S dz = -(rows_z + change of R_s)``, then back substitution
-    ``dx + (dx/dz) dz``.
-    """
-
-    (matrices, by_positions), n_f = factors, march.n_f
-
-    def interval(arriving, of_interval):
-        rows, inverse, hands_on, by_position, hands_on_by_position = of_interval
-        # dx = -(dR/dx)^-1 (rows + dR/dq dq + dR/dp dp); h p_f is added to the first momentum equation: dR/dp is the
-        # unit matrix there
-        on_left = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
-        dx = -matvec(inverse, on_left)
-        gradients = arriving.gradients + matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)
-        # the momentum h D_{F_r} A is the sum of all impulses less the fast rows of the interval, whose change is -rows
-        gradients = gradients.at[:n_f].add(rows[: march.num_fast].reshape(march.r, n_f).sum(0))
-        return Handed(arriving.position + march.last_increment(dx), gradients), dx
-
-    intervals = rows_x, matrices.inverse, matrices.hands_on, *by_positions
-    end, dx = jax.lax.scan(interval, jax.tree.map(jnp.zeros_like, march.start()), intervals)
-    # The slow equations are linear in the arriving quantities: their derivative may be taken at any point.
-    zero = jnp.zeros_like(rows_z)
-    change = jax.jvp(lambda a: march.slow_equations(zero, a)[0], (march.start(),), (end,))[1]
-    dz = -matvec(matrices.slow, rows_z + change)
-    return dz, dx + jnp.sum(matrices.response * march.seen(dz), axis=-1)

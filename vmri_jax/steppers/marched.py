@@ -10,16 +10,8 @@ from vmri_jax.kernels import CONTRACTION
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, NO_WEIGHTS, Accepted, Weights, expected, is_solved
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
-from vmri_jax.steppers.march import (
-    MarchEquations,
-    Matrices,
-    Passed,
-    Worst,
-    inverse_with_multipliers,
-    kept_pass,
-    linearised_pass,
-)
-from vmri_jax.steppers.newton import null_space
+from vmri_jax.steppers.march import MarchEquations, Matrices, Passed, Worst, kept_pass, linearised_pass
+from vmri_jax.steppers.null_space import inverse_with_multipliers, inverse_without_multipliers
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
@@ -77,7 +69,7 @@ class Progress(NamedTuple):
 class Marched(StepSolver):
     """Passes until the next one would change neither the slow nor the fast increments.
 
-    newton: settings; its matrix is "exact", "masses", or "null_space", which is exact and eliminates without
+    settings: of the iteration; its matrix is "exact", "masses", or "null_space", which is exact and eliminates without
         multipliers.
     sizes: (n_s, n_gs, n_f, n_g) and the degree r, for `describe` of the null space method.
 
@@ -85,7 +77,7 @@ class Marched(StepSolver):
     the first pass of an attempt.
     """
 
-    newton: Solver
+    settings: Solver
     sizes: tuple[int, int, int, int, int] | None = None
 
     def init(self, equations: StepEquations) -> MarchMemory:
@@ -98,7 +90,7 @@ class Marched(StepSolver):
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
         weights = Weights.of(equations)
         march = self._march(equations, weights)
-        accepted = Accepted.of(equations, self.newton, weights).with_constraints(equations, weights)
+        accepted = Accepted.of(equations, self.settings, weights).with_constraints(equations, weights)
         z, x = march.flat(guess)
         zero, infinite = jnp.zeros(()), jnp.asarray(jnp.inf)
         start = Progress(
@@ -118,17 +110,20 @@ class Marched(StepSolver):
             done = self._iterate(of_part, accepted, guess, start, memory, limit, is_first)
             return done, march.by_name(done.passed.z, done.passed.x), done.result, done.passes
 
-        parts = solve_in_parts(equations, guess, start, part, self.newton.max_iterations, PLAIN_PASSES)
+        parts = solve_in_parts(equations, guess, start, part, self.settings.max_iterations, PLAIN_PASSES)
         done = parts.solution
-        return self._solution(march, done, parts.result, parts.iterations), self._learned(march, memory, done)
+        passed = done.passed
+        path = memory.path.add(*march.predicted(passed.z, passed.x))
+        learned = MarchMemory(path, passed.x[-1], done.matrices, done.rate)
+        return self._solution(march, done, parts.result, parts.iterations), learned
 
     @property
     def is_exact(self) -> bool:
-        return self.newton.matrix != "masses"
+        return self.settings.matrix != "masses"
 
     @property
     def _has_multipliers(self) -> bool:
-        return self.newton.matrix != "null_space"
+        return self.settings.matrix != "null_space"
 
     def _pass(self, march: MarchEquations, renews, last: Progress, start) -> tuple[Matrices, Passed]:
         """A pass from `start`, the unknowns as in `linearised_pass`, with new matrices if `renews`, else with the last
@@ -153,7 +148,7 @@ class Marched(StepSolver):
         return progress._replace(matrices=matrices, rate=jnp.where(renews, 0.0, progress.rate))
 
     def _march(self, equations: StepEquations, weights: Weights) -> MarchEquations:
-        inverted = inverse_with_multipliers if self._has_multipliers else null_space.inverse_without_multipliers
+        inverted = inverse_with_multipliers if self._has_multipliers else inverse_without_multipliers
         return MarchEquations(equations, inverted, weights)
 
     def _iterate(
@@ -231,16 +226,11 @@ class Marched(StepSolver):
         # |R| = |R before the correction| min(1, expected correction / last correction).
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
         rows = passed.worst.rows * jnp.minimum(shrinks, 1.0)
-        method = Method[self.newton.matrix.upper()]
+        method = Method[self.settings.matrix.upper()]
         status = status_of(equations, result, method, passes, rows=rows, end=end, weights=march.weights)
         if self.is_exact:  # else the fallback names the cause
             status = with_dependent_constraints(equations, status)
         return Solution(x, end, status)
-
-    def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
-        passed = done.passed
-        path = memory.path.add(*march.predicted(passed.z, passed.x))
-        return MarchMemory(path, passed.x[-1], done.matrices, done.rate)
 
     def describe(self) -> list[str]:
         if not self.is_exact:

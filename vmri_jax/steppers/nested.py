@@ -47,7 +47,7 @@ PASSES_OF_UNUSED_MATRIX = 10**6
 """Initial value of the least number of passes with a new matrix: larger than the number of any step."""
 
 
-class NestedState(NamedTuple):
+class NestedMemory(NamedTuple):
     """Memory that a macro step hands to the next one.
 
     matrix: K of the micro intervals.
@@ -103,18 +103,18 @@ class Nested(StepSolver):
     last two, as in stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8).
     """
 
-    newton: Solver
+    settings: Solver
     interval: IntervalStructure
 
-    def init(self, equations: StepEquations) -> NestedState:
+    def init(self, equations: StepEquations) -> NestedMemory:
         r, (n_g, n_gs) = equations.scheme.degree, equations.system.num_constraints(equations.q_s, equations.q_f)
         matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
         slow = PolynomialPredictor.empty(r * (equations.q_s.size + n_gs))
         # with these numbers the first step renews the matrix
         fewest, last = jnp.asarray(0), jnp.asarray(2 * EXTRA_PASSES)
-        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last)
+        return NestedMemory(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last)
 
-    def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
+    def renew(self, equations: StepEquations, memory: NestedMemory) -> NestedMemory:
         """The memory with a new matrix K, unless K is constant.
 
         A large K is kept while it costs at most `EXTRA_PASSES` passes.
@@ -129,19 +129,19 @@ class Nested(StepSolver):
             matrix=matrix, fewest_passes=jnp.where(stale, PASSES_OF_UNUSED_MATRIX, memory.fewest_passes)
         )
 
-    def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedState) -> tuple[Solution, NestedState]:
+    def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedMemory) -> tuple[Solution, NestedMemory]:
         scale, _ = equations.multiplier_scales()
         sweep = MicroSweep(Intervals(equations), self.interval, memory.matrix, scale, memory.multiplier)
-        passes = _Passes(memory, sweep, self.newton)
+        passes = _Passes(memory, sweep, self.settings)
         done = iterated(passes.next, passes.start())
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         end = done.end.q_f, done.p_s, done.end.p_f / equations.micro_dt
         status = status_of(equations, done.result, Method.MASSES, done.passes, rows=done.rows, end=end)
 
-        learned = NestedState(
+        learned = NestedMemory(
             memory.matrix,
-            memory.slow.add(_flat(done.slow, done.slow_multiplier), done.slow.size),
+            memory.slow.add(jnp.append(done.slow, done.slow_multiplier), done.slow.size),
             equations.multipliers(x, memory.multiplier[-1], x.slow_multiplier[-1])[0][-1],
             done.slow_model_error,
             jnp.minimum(memory.fewest_passes, done.passes),
@@ -149,29 +149,27 @@ class Nested(StepSolver):
         )
         return Solution(x, end, status), learned
 
-    def continued(self, memory: NestedState, last: NestedState) -> NestedState:
+    def continued(self, memory: NestedMemory, last: NestedMemory) -> NestedMemory:
         return memory._replace(multiplier=last.multiplier)
 
     def describe(self) -> list[str]:
         inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
+        kind = "per coordinate" if self.interval.is_diagonal else "of its fast variables"
+        renewed = "computed once" if self.interval.is_constant else "renewed with the macro steps"
         return [
             "masses: passes over the slow path, with the micro intervals in order inside",
-            f"  each interval solves for {inside}, with a matrix {self._matrix_in_words()}",
+            f"  each interval solves for {inside}, with a matrix {kind}, {renewed}",
         ]
-
-    def _matrix_in_words(self) -> str:
-        kind = "per coordinate" if self.interval.is_diagonal else "of its fast variables"
-        return f"{kind}, {'computed once' if self.interval.is_constant else 'renewed with the macro steps'}"
 
 
 class _Passes:
     """The iteration over passes of one macro step."""
 
-    def __init__(self, memory: NestedState, sweep: MicroSweep, newton: Solver):
-        self.memory, self.sweep, self.newton = memory, sweep, newton
+    def __init__(self, memory: NestedMemory, sweep: MicroSweep, settings: Solver):
+        self.memory, self.sweep, self.settings = memory, sweep, settings
         self.equations = equations = sweep.intervals.equations
         self.slow_equations = SlowEquations.of(sweep.intervals)
-        self.accepted = Accepted.of(equations, newton)
+        self.accepted = Accepted.of(equations, settings)
         self.mass = constant_mass(equations.system)
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
         self.num_multipliers = equations.system.num_constraints(equations.q_s, equations.q_f)[1]
@@ -238,15 +236,10 @@ class _Passes:
             p_s=p_s,
             rows=rows,
             passes=passes,
-            result=self.newton.status(ratio, passes),
+            result=self.settings.status(ratio, passes),
         )
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""
         size = self.r * self.n_s
         return z[:size].reshape(self.r, self.n_s), z[size:].reshape(self.r, -1)
-
-
-def _flat(slow, slow_multiplier):
-    """The slow unknowns z: slow increments, then slow multipliers."""
-    return jnp.concatenate([slow.reshape(-1), slow_multiplier.reshape(-1)])

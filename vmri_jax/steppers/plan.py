@@ -24,14 +24,13 @@ from typing import Any
 import jax.numpy as jnp
 
 from vmri_jax.kernels import COLLOCATES, DRIFTS, LARGEST_RENEWED
-from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.discrete_lagrangian import Placed, lagrangian, placed_potentials
+from vmri_jax.schemes.discrete_lagrangian import PlacedTerm, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
@@ -49,7 +48,7 @@ from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 from vmri_jax.steppers.subsystems import fast_part, frozen_slow, joined, slow_part
 
-Parts = tuple[list[Placed], dict[int, list[Placed]]]
+Parts = tuple[list[PlacedTerm], dict[int, list[PlacedTerm]]]
 """Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals
 that a copy of their rule spans; the keys k increase, start with 1, and each is a multiple of the one before."""
 
@@ -188,8 +187,12 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
         return Solved(system, scheme, marched, rows)
     if _is_linear(system, scheme, interval(), q_s):
         return Linear(system, scheme, interval())
-    approximate = _approximate(system, scheme, solver, interval(), rows, q_s.size, q_f.size, num_slow)
-    return Solved(system, scheme, approximate, rows)
+    # modes and drifts know fast variables alone (`_joins`); Nested keeps a larger matrix over many steps
+    modes = COLLOCATES and not q_s.size and q_f.size <= SMALL and _has_modes(system, scheme)
+    if solver.matrix == "modes" or (solver.matrix == "auto" and modes and not interval().is_diagonal):
+        return Solved(system, scheme, Collocation(solver, num_slow), rows)
+    is_drift = DRIFTS and _is_drift(system, scheme)
+    return Solved(system, scheme, Rattle(solver, rows) if is_drift else Nested(solver, interval()), rows)
 
 
 def _joins(
@@ -207,25 +210,6 @@ def _joins(
     if _has_modes(system, scheme):
         return n_s + n_f <= SMALL
     return n_f > 0 and n_s + n_f <= LARGEST_RENEWED and not interval().is_diagonal
-
-
-def _approximate(
-    system: System,
-    scheme: Scheme,
-    solver: Solver,
-    interval: IntervalStructure,
-    rows: Sparsity,
-    n_s: int,
-    n_f: int,
-    num_slow: int,
-) -> StepSolver:
-    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; modes and drifts know fast
-    variables alone (`_joins`)."""
-    small = n_s == 0 and n_f <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
-    chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
-    if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
-        return Collocation(solver, num_slow)
-    return Rattle(solver, rows) if DRIFTS and _is_drift(system, scheme) else Nested(solver, interval)
 
 
 def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:

@@ -26,7 +26,7 @@ from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated
 
-RattleState: TypeAlias = Float[Array, "2 n_g"]
+RattleMemory: TypeAlias = Float[Array, "2 n_g"]
 """Multipliers lambda in the last two steps, the last step first."""
 
 
@@ -49,14 +49,14 @@ class Rattle(StepSolver):
     sparsity: of ``G M^-1 G^T``.
     """
 
-    newton: Solver
+    settings: Solver
     sparsity: Sparsity
 
-    def init(self, equations: StepEquations) -> RattleState:
+    def init(self, equations: StepEquations) -> RattleMemory:
         return jnp.zeros((2, equations.system.num_constraints(equations.q_s, equations.q_f)[0]))
 
-    def solve(self, equations: StepEquations, guess: Unknowns, memory: RattleState) -> tuple[Solution, RattleState]:
-        system, h, q, newton = equations.system, equations.macro_dt, equations.q_f, self.newton
+    def solve(self, equations: StepEquations, guess: Unknowns, memory: RattleMemory) -> tuple[Solution, RattleMemory]:
+        system, h, q, settings = equations.system, equations.macro_dt, equations.q_f, self.settings
         move_by = constant_mass(system).fast_mass.inverse().times  # M^-1
 
         def constraints(t, q):
@@ -77,13 +77,13 @@ class Rattle(StepSolver):
         x = h * move_by(equations.p_f) - move(mu)  # M^-1 (h p - G_0^T mu)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
         schur = self.sparsity.inverse(jax.vmap(push)(columns))  # (G_1 M^-1 G_0^T)^-1
-        accepted = Accepted.of(equations, newton)
+        accepted = Accepted.of(equations, settings)
 
         def judged(x, mu, g, iterations) -> Correction:
             dmu = schur.times(g)
             dx = move(dmu)
             ratio = accepted.ratio((0.0, max_abs(dx)), (0.0, max_abs(x)), iterations)
-            return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(ratio, iterations))
+            return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), settings.status(ratio, iterations))
 
         def corrected(last: Correction) -> Correction:
             x = last.x - last.dx
@@ -101,7 +101,7 @@ class Rattle(StepSolver):
         last = equations.multipliers(unknowns, memory[0], jnp.zeros(0))[0].reshape(-1)
         return Solution(unknowns, end, status), jnp.stack([last, memory[0]])
 
-    def continued(self, memory: RattleState, last: RattleState) -> RattleState:
+    def continued(self, memory: RattleMemory, last: RattleMemory) -> RattleMemory:
         return last
 
     def describe(self) -> list[str]:

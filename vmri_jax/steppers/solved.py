@@ -19,7 +19,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights
-from vmri_jax.steppers.newton.implicit import differentiable
+from vmri_jax.steppers.implicit import differentiable
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
 ROOT = "root"
@@ -75,7 +75,7 @@ class StepSolver(ABC):
         """In words, one line each."""
 
 
-class SolvedState(NamedTuple):
+class SolvedMemory(NamedTuple):
     """Memory from which the next iteration starts.
 
     multiplier, slow_multiplier: Lagrange multipliers of the step before, at its last control node with multipliers.
@@ -107,18 +107,18 @@ class Solved(Stepper):
     solver: StepSolver
     sparsity: Sparsity
 
-    def init(self, state: State, macro_dt) -> SolvedState:
+    def init(self, state: State, macro_dt) -> SolvedMemory:
         n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
         solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt))
         at_rest = () if self.system.has_constant_mass else (jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f))
-        return SolvedState(jnp.zeros(n_g), jnp.zeros(n_gs), jnp.zeros(()), at_rest, solver)
+        return SolvedMemory(jnp.zeros(n_g), jnp.zeros(n_gs), jnp.zeros(()), at_rest, solver)
 
-    def renew(self, state: State, memory: SolvedState, macro_dt) -> SolvedState:
+    def renew(self, state: State, memory: SolvedMemory, macro_dt) -> SolvedMemory:
         return memory._replace(
             solver=self.solver.renew(StepEquations.of(self.system, self.scheme, state, macro_dt), memory.solver)
         )
 
-    def advance(self, state: State, memory: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
+    def advance(self, state: State, memory: SolvedMemory, macro_dt) -> tuple[State, StepInfo, SolvedMemory]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt, memory.last_dt)
         # no derivative enters the iteration; `derivative` attaches the one of the root
         solution, solver = self._solve(*jax.lax.stop_gradient((equations, memory)))
@@ -132,10 +132,10 @@ class Solved(Stepper):
         last_dt = jnp.asarray(macro_dt, dtype=float)
         velocity = jax.lax.stop_gradient((x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt))
         velocity = () if self.system.has_constant_mass else velocity
-        memory = SolvedState(lambdas[0][-1, -1], lambdas[1][-1], last_dt, velocity, solver)
+        memory = SolvedMemory(lambdas[0][-1, -1], lambdas[1][-1], last_dt, velocity, solver)
         return end, info, memory
 
-    def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
+    def _solve(self, equations: StepEquations, memory: SolvedMemory) -> tuple[Solution, Any]:
         """The solution, from straight motion: at the velocities of the projected momenta for constant masses; else,
         since near poles of angles a velocity ``M^-1 p`` says little about the next step, at the mean velocities of the
         last intervals."""
@@ -150,7 +150,7 @@ class Solved(Stepper):
         guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
-    def continued(self, memory: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
+    def continued(self, memory: SolvedMemory, last: SolvedMemory, state: State, macro_dt) -> SolvedMemory:
         return last._replace(solver=self.solver.continued(memory.solver, last.solver))
 
     def describe(self) -> list[str]:

@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
-from jax.scipy.linalg import block_diag
 
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import ConstantMass, WithMassMatrix
 from vmri_jax.mechanics.projection import closed_masses, have_closed_masses
 from vmri_jax.mechanics.system import RATE_OF, System
 from vmri_jax.mechanics.terms import KINDS, POSITIONS, Term
-from vmri_jax.schemes.discrete_lagrangian import Placed, placed_potentials
+from vmri_jax.schemes.discrete_lagrangian import PlacedTerm, placed_potentials
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
@@ -43,7 +42,7 @@ class OfPart:
         return self.term(params, **{"t": arguments[0], self.part: q, self.other: jnp.zeros(self.num_other)})
 
 
-def slow_part(system: System, potentials: Sequence[Placed], num_fast: int) -> tuple[System, Scheme]:
+def slow_part(system: System, potentials: Sequence[PlacedTerm], num_fast: int) -> tuple[System, Scheme]:
     """The system of the slow variables, and the scheme of their step over the macro interval.
 
     Args:
@@ -54,7 +53,7 @@ def slow_part(system: System, potentials: Sequence[Placed], num_fast: int) -> tu
     return _part(system, ("q_s", "q_f", num_fast), constant_mass(system).slow, "slow_constraint", potentials)
 
 
-def fast_part(system: System, potentials: Sequence[Placed], num_slow: int) -> tuple[System, Scheme]:
+def fast_part(system: System, potentials: Sequence[PlacedTerm], num_slow: int) -> tuple[System, Scheme]:
     """The system of the fast variables, and the scheme of a step of k micro intervals.
 
     Args:
@@ -66,7 +65,7 @@ def fast_part(system: System, potentials: Sequence[Placed], num_slow: int) -> tu
 
 
 def _part(
-    system: System, positions: tuple[str, str, int], mass, constraint: str, potentials: Sequence[Placed]
+    system: System, positions: tuple[str, str, int], mass, constraint: str, potentials: Sequence[PlacedTerm]
 ) -> tuple[System, Scheme]:
     """A part with its masses and the constraint of this field, and its scheme; W, or else V, is its fast potential."""
     main = next((part for name in ("W", "V") for part in potentials if part.term.name == name), None)
@@ -135,7 +134,8 @@ def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Schem
     if system.is_constrained:
         functions["constraint"] = Rheonomic(OfJoined(system.of_kind("constraint"), ("t", *POSITIONS), num_slow))
     if system.has_constant_mass:
-        kinetic = ConstantMass(jnp.zeros(0), _joined_masses(constant_mass(system)))
+        masses = constant_mass(system)
+        kinetic = ConstantMass(jnp.zeros(0), jnp.concatenate(masses.diagonal) if masses.is_diagonal else masses.matrix)
     else:
         kinetic = OfJoined(system.of_kind("kinetic"), KINDS["kinetic"].arguments, num_slow)
     together = System(kinetic, **functions, params=system.params, potentials=potentials)
@@ -146,14 +146,6 @@ def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Schem
         place[name] = micro(rule.rule)
     rules |= {"kinetic": scheme.kinetic, "constraint": scheme.constraint, "force": micro(scheme.force.rule)}
     return together, Scheme(1, scheme.degree, **rules)
-
-
-def _joined_masses(kinetic: ConstantMass):
-    """The masses of the slow and then of the fast variables, as one diagonal or one matrix."""
-    masses = kinetic.slow, kinetic.fast
-    if all(mass.ndim == 1 for mass in masses):
-        return jnp.concatenate(masses)
-    return block_diag(*(mass if mass.ndim == 2 else jnp.diag(mass) for mass in masses))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from vmri_jax.mechanics.checks import digest, operations
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.terms import Named
+from vmri_jax.mechanics.terms import KINDS, Named
 from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.simulation import Simulation
 
@@ -31,8 +31,10 @@ def identity(simulation: Simulation, start: State) -> dict[str, str]:
     same name makes another run.
     """
     system, texts = simulation.system, {"solver": type(simulation.solver).__name__}
-    for name in ("system", "scheme", "solver", "macro_dt", "save_every"):
+    for name in ("scheme", "solver", "macro_dt", "save_every"):
         texts |= describe(name, getattr(simulation, name))
+    for name in (*KINDS, "params"):
+        texts |= describe(f"system.{name}", getattr(system, name))
     texts |= describe("save_micro", simulation.save.micro) | describe("state", start)
     values = {"t": start.t, "q_s": start.q_s, "q_f": start.q_f, "v_s": start.q_s, "v_f": start.q_f}
     for term in system.terms:

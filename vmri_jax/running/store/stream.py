@@ -97,7 +97,7 @@ def stream(
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
-    two_nodes = Saved(np.zeros((2, run.width)), np.asarray(0), np.asarray(-1)).trajectory(run)
+    two_nodes = Saved(run.columns.split(np.zeros((2, run.width))), np.asarray(0), np.asarray(-1)).trajectory(run)
     arrays = {name: Kept(rows[0], DIMENSIONS[name][1:]) for name, rows in rows_of(two_nodes).items()}
     with (
         interrupts_noted() as interrupted,
@@ -142,7 +142,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
         size = min(chunk - (record.saved + 1) % chunk, rows - record.saved)
         saved, cursor, current = current.advance(cursor, size)
-        piece, table = saved.trajectory(run, record.step), np.concatenate([before, run.table(saved)])
+        piece, table = saved.trajectory(run, record.step), np.concatenate([before, saved.nodes.table])
         if not record.saved:
             run.tell_of_start("stream", piece)
         has_warned = has_warned or run.warn("stream", table, np.append(start.t[: len(before)], piece.states.t))

@@ -11,9 +11,38 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from vmri_jax.kernels import matvec
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Intervals
-from vmri_jax.steppers.march import MarchEquations, linearised_pass, solve
+from vmri_jax.steppers.march import FlatArriving, MarchEquations, Matrices, linearised_pass
+
+
+def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x):
+    """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and JAX can transpose it.
+
+    Forward elimination with z fixed, then ``S dz = -(rows_z + change of R_s)``, then back substitution
+    ``dx + (dx/dz) dz``.
+    """
+    (matrices, by_positions), n_f = factors, march.n_f
+
+    def interval(arriving, of_interval):
+        rows, inverse, hands_on, by_position, hands_on_by_position = of_interval
+        # dx = -(dR/dx)^-1 (rows + dR/dq dq + dR/dp dp); h p_f is added to the first momentum equation: dR/dp is the
+        # unit matrix there
+        on_left = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
+        dx = -matvec(inverse, on_left)
+        gradients = arriving.gradients + matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)
+        # the momentum h D_{F_r} A is the sum of all impulses less the fast rows of the interval, whose change is -rows
+        gradients = gradients.at[:n_f].add(rows[: march.num_fast].reshape(march.r, n_f).sum(0))
+        return FlatArriving(arriving.position + march.last_increment(dx), gradients), dx
+
+    intervals = rows_x, matrices.inverse, matrices.hands_on, *by_positions
+    end, dx = jax.lax.scan(interval, jax.tree.map(jnp.zeros_like, march.start()), intervals)
+    # The slow equations are linear in the arriving quantities: their derivative may be taken at any point.
+    zero = jnp.zeros_like(rows_z)
+    change = jax.jvp(lambda a: march.slow_equations(zero, a)[0], (march.start(),), (end,))[1]
+    dz = -matvec(matrices.slow, rows_z + change)
+    return dz, dx + jnp.sum(matrices.response * march.seen(dz), axis=-1)
 
 
 def _direction(equations: StepEquations, x: Unknowns):

@@ -25,6 +25,9 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
 
+from vmri_jax.kernels import inverse_in_loop
+from vmri_jax.kernels.saddle import saddle
+
 
 def motions(jacobian):
     """Bases P (..., n, n - n_g) of the null space, and right inverses W (..., n, n_g), of independent rows G
@@ -41,6 +44,12 @@ def motions(jacobian):
     square = jnp.swapaxes(triangle[..., :n_g, :], -1, -2)
     eye = jnp.broadcast_to(jnp.eye(n_g), square.shape)
     return q[..., n_g:], q[..., :n_g] @ jax.scipy.linalg.solve_triangular(square, eye, lower=True)
+
+
+def inverse_with_multipliers(a, b, c, nodes: int):
+    """The inverse of ``[[A, B], [C, 0]]`` by elimination, regularised for dependent constraints
+    (`vmri_jax.kernels.saddle`)."""
+    return inverse_in_loop(saddle(a, b, c) if b.shape[-1] else a)
 
 
 def inverse_without_multipliers(a, b, c, nodes: int):

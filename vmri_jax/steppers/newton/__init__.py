@@ -1,1 +1,0 @@
-"""Linear solvers for Newton's matrix of a macro step, and the derivative of the solution."""
