@@ -3,12 +3,13 @@
 Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints counts as kept below
 
     allowed_i = tolerance size_i + ROUNDING eps (terms_i + reach_i)
-    size_i = max(terms_i, min(|G_i|^2 / |hess g_i|, reach_i))        reach_i = sum_j |dg_i/dq_j| / w_j max_k |w_k q_k|
+    size_i = max(terms_i, min(|G_i|^2 / |hess g_i|, reach_i))        reach_i = sum_j |dg_i/dq_j| / w_j largest
 
-with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), and its change over
-its radius of curvature. The weights w, square roots of the masses, give all coordinates one unit: lengths of gradients
-and reach_i, the change of a row over the largest position, which bounds its round-off, are taken with them. Mass
-matrices are judged with a diagonal of ones.
+with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), its change over its
+radius of curvature, and the largest position ``max_k |w_k q_k|`` or, if that is larger, the displacement that the
+constraints take from a step: at the origin the round-off of this displacement is all that there is. The weights w,
+square roots of the masses, give all coordinates one unit: lengths of gradients and reach_i, the change of a row over
+the largest position, which bounds its round-off, are taken with them. Mass matrices are judged with a diagonal of ones.
 """
 
 from contextlib import nullcontext
@@ -134,8 +135,9 @@ class Rows(NamedTuple):
         return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * self.rounding
 
     @classmethod
-    def of(cls, function, q, weights: Any = 1.0) -> "Rows":
-        """The rows (k,) of a function of q (n,)."""
+    def of(cls, function, q, weights: Any = 1.0, held_back: Any = 0.0) -> "Rows":
+        """The rows (k,) of a function of q (n,); `held_back` is the displacement that they take from a step, times
+        weights."""
         direction = np.random.default_rng(0).normal(size=q.size) / weights
 
         def gradients_and_values(q):
@@ -144,17 +146,18 @@ class Rows(NamedTuple):
 
         gradients, bends, values = jax.jvp(gradients_and_values, (q,), (direction,), has_aux=True)
         gradients, bends = gradients / weights, bends / weights
-        terms, reach = sizes_of_terms(function, q), jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * q))
+        largest = jnp.maximum(max_abs(weights * q), max_abs(held_back))
+        terms, reach = sizes_of_terms(function, q), jnp.sum(jnp.abs(gradients), axis=1) * largest
         # |hess g e| of a random direction e for the norm of the Hessian
         squared, bend = jnp.sum(gradients**2, axis=1), jnp.linalg.norm(bends, axis=1)
         radius = jnp.where(bend > 0, squared / jnp.where(bend > 0, bend, 1.0), 0.0)
         return cls(values, jnp.maximum(terms, jnp.minimum(radius, reach)), terms + reach, gradients)
 
 
-def rows_at(system: System, t, q_s, q_f, weights) -> Rows:
-    """The `Rows` of a system, for weights w (n,) of the coordinates."""
+def rows_at(system: System, t, q_s, q_f, weights, held_back: Any = 0.0) -> Rows:
+    """The `Rows` of a system, for weights w (n,) of the coordinates; `held_back` as of `Rows.of`."""
     n_s = q_s.shape[0]
-    return Rows.of(lambda q: _values(system, t, q[:n_s], q[n_s:]), jnp.concatenate([q_s, q_f]), weights)
+    return Rows.of(lambda q: _values(system, t, q[:n_s], q[n_s:]), jnp.concatenate([q_s, q_f]), weights, held_back)
 
 
 def _values(system: System, *configuration):

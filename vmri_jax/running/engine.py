@@ -188,7 +188,7 @@ def _as_saved(run, rows, steps):
     *phase, info, micro = (rows[:, column] for column in run.columns[:-1])
 
     def node(t, *phase):
-        state, table = observed(run.system, State(t, *phase), run.solver.tolerance)
+        state, table = observed(run.system, State(t, *phase), run.macro_dt, run.solver.tolerance)
         return *list(vars(state).values())[1:], table
 
     *phase, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *phase)
