@@ -55,6 +55,12 @@ def test_a_double_integrator():
     np.testing.assert_allclose(run.p_s[-1], optimum.trajectory.p_s[-1], atol=1e-13)
 
 
+def test_forces_of_controls_choose_the_matrix():
+    """Without forces `galerkin` takes modes, which a system with the forces of controls does not have."""
+    goal: dict[str, Any] = {"goal": at_rest_at_one, "scheme": vm.galerkin(1, 2), "macro_dt": 0.5, "num_steps": 2}
+    np.testing.assert_allclose(minimize(CART, effort, **goal).controls[:, 0], [4, -4], atol=1e-9)
+
+
 def miss(state):
     return 3 * jnp.sum((state.q_s - 1.0) ** 2) / 2
 

@@ -40,7 +40,8 @@ def slow_position(state):
 
 
 def fit_of_two(data):
-    return vm.fit(CHAIN, data, {"omega": Unknown(19.5, lower=0), "v_s": CHAIN.v_s + 0.05}, scheme=SCHEME, macro_dt=DT)
+    """The names are not in alphabetical order, in which JAX sorts those of a dictionary."""
+    return vm.fit(CHAIN, data, {"v_s": CHAIN.v_s + 0.05, "omega": Unknown(19.5, lower=0)}, scheme=SCHEME, macro_dt=DT)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_parts_of_a_driven_motion_start_at_their_times():
 
 
 def test_parameters_are_found_within_their_errors(found):
-    truth = {"omega": 20.0, "v_s[0]": float(CHAIN.v_s[0])}
+    truth = {"v_s[0]": float(CHAIN.v_s[0]), "omega": 20.0}
     assert found.success
     assert found.labels == list(truth)
     for label, (low, high) in found.intervals(0.9999).items():
@@ -116,7 +117,7 @@ def test_some_values_of_some_quantities_without_their_sigma(found):
     slow = Measured(whole.t[10:30], whole.values[10:30, 0], observe=slow_position)
     fit = fit_of_two([Measured(whole.t, values), slow])
     assert len(fit.residuals) == np.isfinite(values).sum() + 20
-    assert fit.values[0] == pytest.approx(20.0, abs=5 * fit.standard_errors["omega"])
+    assert fit.parameters["omega"] == pytest.approx(20.0, abs=5 * fit.standard_errors["omega"])
     assert fit.sigma == pytest.approx(1e-3, rel=0.2)
     assert fit.standard_errors["omega"] == pytest.approx(found.standard_errors["omega"], rel=0.2)
     assert "sigma estimated" in str(fit)

@@ -33,6 +33,19 @@ def test_rest_up_to_roundoff_is_no_loss(fast_potential, slow_potential):
         vm.simulate(system, vm.fully_explicit(1), moved, macro_dt=0.25, num_steps=3)
 
 
+@pytest.mark.parametrize("scheme", [vm.fully_implicit(2), vm.galerkin(1, 3)])
+def test_a_weight_that_rests_at_the_origin(scheme):
+    """All positions are zero: the displacement that the rail takes from a step is the size of round-off, of 1e-51 m for
+    `galerkin`, and the energy of the velocity that it takes the size of lost energy, of 2e-33 J for `fully_implicit`.
+    """
+    mass = vm.ConstantMass([], [2.0, 2.0])
+    system = vm.System(mass, lambda q_s, q_f, params: 19.62 * q_f[1], constraint=lambda q_s, q_f, params: q_f[1:])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = vm.simulate(vm.Problem(system, [], [0.0, 0.0]), scheme, macro_dt=0.01, num_steps=2)
+    np.testing.assert_allclose(run.multipliers()["constraint"], -19.62)
+
+
 def rotating_frame(q_s, q_f, v_s, v_f, turn):
     velocity = v_f + turn * jnp.stack([-q_f[1], q_f[0]])
     return velocity @ velocity / 2

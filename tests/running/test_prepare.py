@@ -110,6 +110,14 @@ def test_tracers_and_short_floats_are_refused(fpu):
     run = vm.prepare(fpu.system.replace(params={"omega": 30.0}), vm.fully_explicit(3), fpu.state(), **STEPS)
     with pytest.raises(ValueError, match=r"params\['omega'\] has dtype float32; give float64"):
         run(params={"omega": np.float32(30.0)})
+    start = fpu.state()
+    for called in (
+        lambda x: run(params={"omega": x}),
+        lambda x: run(macro_dt=x),
+        lambda x: run(replace(start, q_f=x * start.q_f)),
+    ):
+        with pytest.raises(ValueError, match=r"run: arguments are tracers; .*take simulate"):
+            jax.grad(called)(jnp.array(0.02))
     short = jax.tree.map(lambda a: np.asarray(a, dtype=np.float32), fpu.state())
     for state, name in ((short, "the t of state"), (replace(short, t=0.0), "q_s")):
         with pytest.raises(ValueError, match=f"{name} has dtype float32; give float64"):

@@ -99,6 +99,21 @@ def test_rayleigh_damping_of_a_spring_in_a_joint():
     assert float(system.forces(0.0, jnp.array([0.4]), none, jnp.array([2.0]), none)[0][0]) == pytest.approx(-0.12)
 
 
+def test_rayleigh_damping_of_a_stretched_spring_leaves_a_common_rotation():
+    """The bodies of the spring turn together, about another axis. By the directors the energy of the spring has a
+    curvature along this rotation."""
+    bodies = [sc.RigidBody(name, 1.0, [0.2, 0.25, 0.3], [x, 0.0, 0.0]) for name, x in (("a", 0.5), ("b", 1.5))]
+    effects = [
+        sc.Revolute(("ground", "a"), at=[0, 0, 0], name="bearing"),
+        sc.Revolute(("a", "b"), at=[1, 0, 0], axis=[0.0, 0.6, 0.8], name="hinge"),
+        sc.JointSpring("hinge", 8.0, neutral=0.3),
+        sc.RayleighDamping(stiffness=0.02),
+    ]
+    scene = sc.Scene(bodies, effects, coordinates="directors").with_rates({"bearing": 1.0, "hinge": 0.0})
+    force = np.concatenate(scene.system().forces(0.0, *scene.start))
+    assert np.abs(force).max() < 1e-15  # 0.03 by the directors
+
+
 def test_motions_of_pairs_with_and_without_coordinates_have_the_names_of_their_pairs():
     """The pair of b closes a loop, and its angle comes from directors: its row is a term of its own, after those of the
     other pairs."""

@@ -217,8 +217,6 @@ def transcribed(
     prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
     parts = scheme.num_micro if grid == "micro" else 1
     _check_durations(scheme, grid, parts)
-    # A fallback is a branch of the compiled step: `jax.vmap` over all steps would compute both of its sides.
-    solver = solver or plan(system, scheme, state).first
     u = np.zeros(num_controls)
     names = problem.names or Names()
     slots = (names.arrays("s", state.q_s.size), names.arrays("f", state.q_f.size))
@@ -235,17 +233,21 @@ def transcribed(
         if getattr(value, "ndim", None) != dimensions:
             raise Refused(f"minimize: {name} has {describe(value)}; it must be {words}.")
     functions = {**NO_AIMS, **aims}
-    return Transcription(
+    setup = Transcription(
         system.replace(params=params),
         state,
         scheme,
-        solver,
+        solver or Solver(),
         np.asarray(float(macro_dt)),
         traced_once(actuate),
         **{name: traced_once(function) for name, function in functions.items()},
         bounds=_bounds(bounds, num_controls),
         parts=parts,
     )
+    # The plan is that of a system with forces. A fallback is a branch of the compiled step: `jax.vmap` over all steps
+    # would compute both of its sides.
+    driven = setup.driven(np.zeros((1, parts, num_controls)), state.t)
+    return replace(setup, solver=solver or plan(driven, scheme, state).first)
 
 
 def _check_durations(scheme: SchemeLike, grid: str, parts: int) -> None:

@@ -172,15 +172,17 @@ class _Search:
 
         @jax.jit
         def program(numbers, *arguments):
-            (unknowns, sigma, macro_dt), scale = numbers
+            (starts, sigma, macro_dt), scale = numbers
             search = copy(self)
             search.shooting, search.scale = copy(self.shooting), scale
-            unknowns = Unknowns({name: Unknown.of(values) for name, values in unknowns.items()})
+            unknowns = Unknowns(dict(zip(names, map(Unknown.of, starts), strict=True)))
             vars(search.shooting).update(unknowns=unknowns, sigma=sigma, macro_dt=macro_dt)
             return function(search, *arguments)
 
-        unknowns = {name: unknown.numbers for name, unknown in self.shooting.unknowns.unknowns.items()}
-        return partial(program, ((unknowns, self.shooting.sigma, self.shooting.macro_dt), self.scale))
+        # the names are no arguments: JAX would sort them, and the search variables are in the order of the user
+        names, unknowns = zip(*self.shooting.unknowns.unknowns.items(), strict=True)
+        starts = [unknown.numbers for unknown in unknowns]
+        return partial(program, ((starts, self.shooting.sigma, self.shooting.macro_dt), self.scale))
 
     def residual(self, x, args):
         """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search

@@ -3,16 +3,18 @@
 Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints counts as kept below
 
     allowed_i = tolerance size_i + ROUNDING eps (terms_i + reach_i)
-    size_i = max(terms_i, min(|G_i|^2 / |hess g_i|, reach_i))        reach_i = sum_j |dg_i/dq_j| / w_j max_k |w_k q_k|
+    size_i = max(terms_i, min(|G_i|^2 / |hess g_i|, reach_i))        reach_i = sum_j |dg_i/dq_j| / w_j largest
 
-with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), and its change over
-its radius of curvature. The weights w, square roots of the masses, give all coordinates one unit: lengths of gradients
-and reach_i, the change of a row over the largest position, which bounds its round-off, are taken with them.
+with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), its change over its
+radius of curvature, and the largest position ``max_k |w_k q_k|`` or, if that is larger, the displacement that the
+constraints take from a step: at the origin the round-off of this displacement is all that there is. The weights w,
+square roots of the masses, give all coordinates one unit: lengths of gradients and reach_i, the change of a row over
+the largest position, which bounds its round-off, are taken with them.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -80,11 +82,13 @@ class Slopes(NamedTuple):
         """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), for velocities (n,)."""
         return jnp.stack([max_abs(self.values), max_abs(matvec(self.jacobian, v) + self.rates)])
 
-    def scaled(self, weights) -> ScaledRows:
-        """The `ScaledRows`, for weights w (n,) of the coordinates."""
+    def scaled(self, weights, taken: Any = 0.0) -> ScaledRows:
+        """The `ScaledRows`, for weights w (n,) of the coordinates; `taken` is the displacement that the constraints
+        take from a step, times weights."""
         direction = np.random.default_rng(0).normal(size=self.q.size) / weights
         gradients, bends = self.jacobian / weights, self.bent(direction) / weights
-        reach = jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * self.q))
+        largest = jnp.maximum(max_abs(weights * self.q), max_abs(taken))
+        reach = jnp.sum(jnp.abs(gradients), axis=1) * largest
         # |hess g e| of a random direction e for the norm of the Hessian
         squared, bend = jnp.sum(gradients**2, axis=1), jnp.linalg.norm(bends, axis=1)
         radius = jnp.where(bend > 0, squared / jnp.where(bend > 0, bend, 1.0), 0.0)

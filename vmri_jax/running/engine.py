@@ -184,7 +184,7 @@ def _as_saved(run, nodes: Columns, steps) -> Columns:
     """The nodes after these numbers of macro steps, with projected momenta and `Observables`."""
 
     def node(t, *phase):
-        state, table = observed(run.system, State(t, *phase), run.solver.tolerance)
+        state, table = observed(run.system, State(t, *phase), run.macro_dt, run.solver.tolerance)
         return state.p_s, state.p_f, table
 
     p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *nodes[:4])

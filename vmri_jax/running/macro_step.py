@@ -63,7 +63,7 @@ def _step(arguments, exact: bool = False):
     system, scheme, state, macro_dt, solver = arguments
     planned = plan(system, scheme, state, solver.exact() if exact else solver)
     state, info, _ = planned.step(state, planned.init(state, macro_dt), macro_dt)
-    state, table = observed(system, state, solver.tolerance)
+    state, table = observed(system, state, macro_dt, solver.tolerance)
     now = Observables.of(table)
     # rows that contradict each other leave increments that converge
     fails = (info.result <= Result.CONVERGED_AT_ROUNDOFF) & ~is_right(now)

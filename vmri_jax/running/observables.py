@@ -68,7 +68,7 @@ class Observables(NamedTuple):
     solved, implied: 1 where the rows that are solved for, and the implied rows, are kept, see `are_kept`; else 0.
     kinetic: ``v . M v / 2``: T may have terms of lower degree in v, as in a frame that turns, and ``p . v - T`` is then
         no size.
-    terms: ``|T| + |V| + |W| + sum_i |V_i|``.
+    terms: ``|T| + |V| + |W| + sum_i |V_i|``, and the kinetic energy of the momenta that constraints take from a step.
     rounding: ``q . M q / 2``, whose part eps^2 / H^2 is the kinetic energy of velocities that come from round-off of
         the positions.
     volume: log det M of a mass matrix M that depends on positions; 0 for constant masses.
@@ -95,12 +95,13 @@ class Observables(NamedTuple):
         return np.array([[self.energy[0], *(column.max() for column in self[1:-1]), self.volume[-1]]])
 
 
-def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State, Any]:
+def observed(system: System, state: State, macro_dt: Any = 0.0, tolerance: Any = 0.0) -> tuple[State, Any]:
     """A state as it is saved, with momenta projected onto the hidden constraints, ``G v + dg/dt = 0``, and its
     `Observables` as an array (9,).
 
     A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes
-    mu, and not the motion: only momenta that are saved are projected. `tolerance` is of the solver.
+    mu, and not the motion: only momenta that are saved are projected. `macro_dt` is H of the step that ends in the
+    state, `tolerance` of its solver.
     """
     slopes = slopes_at(system, state.t, state.q_s, state.q_f)
     solved = sum(system.num_constraints(state.q_s, state.q_f))
@@ -115,8 +116,12 @@ def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State,
         q, diagonal = jnp.concatenate([state.q_s, state.q_f]), jnp.diagonal(masses)
         kinetic, rounding = v @ masses @ v / 2, q @ masses @ q / 2
         volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
-    kept = are_kept(slopes.scaled(weights_of(diagonal)), solved, tolerance)
-    values = sum(parts), *slopes.residual(v), *kept, kinetic, sum(map(jnp.abs, parts)), rounding, volume
+    weights = weights_of(diagonal)
+    # M^-1/2 G^T nu: times H the displacement that constraints take from a step, with its weights
+    taken = (jnp.concatenate([state.p_s, state.p_f]) - jnp.concatenate([p_s, p_f])) / weights
+    kept = are_kept(slopes.scaled(weights, macro_dt * taken), solved, tolerance)
+    terms = sum(map(jnp.abs, parts)) + taken @ taken / 2
+    values = sum(parts), *slopes.residual(v), *kept, kinetic, terms, rounding, volume
     return State(state.t, *phase), jnp.stack([jnp.asarray(value, dtype=float) for value in values])
 
 

@@ -29,7 +29,7 @@ from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened,
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused, warn_user
-from vmri_jax.running.arguments import Save, check_once, check_run, check_step_size, nothing_fast
+from vmri_jax.running.arguments import Save, check_once, check_run, check_step_size, nothing_fast, refuse_tracers
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -102,7 +102,7 @@ class Simulation:
                 failure on.
 
         Raises:
-            ValueError: arrays whose shapes differ from the shapes of the run.
+            ValueError: arrays whose shapes differ from the shapes of the run, a call inside of a transformation.
             SimulationError: a step failed.
         """
         run = self.with_arguments(state, macro_dt, params, num_steps)
@@ -132,6 +132,7 @@ class Simulation:
 
     def with_arguments(self, state=None, macro_dt=None, params=None, num_steps: int | None = None) -> "Simulation":
         """The run with other arguments, see `__call__`, by the same program."""
+        refuse_tracers("run", (state, macro_dt, params), ", or take simulate")
         changes: dict[str, Any] = {}
         if macro_dt is not None:
             check_step_size(macro_dt, "run")

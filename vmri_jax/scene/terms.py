@@ -182,21 +182,32 @@ class EffectTerm:
         return [place for of_kind in chain(*self.roles) if of_kind.rows for place in of_kind.rows.places]
 
 
+def stiffness_times(energy: Callable, q, v, params):
+    """``K v`` with the Hessian K of an energy by its argument q, as the derivative of the gradient along v."""
+    return jax.jvp(jax.grad(lambda q: energy(q, params)), (q,), (v,))[1]
+
+
 @dataclass(frozen=True)
 class TangentDamping:
-    """``F = -beta K v`` with the Hessian K of the energy of some terms; beta is the parameter "stiffness"."""
+    """``F = -beta K v``, K v the sum of `terms`, forces; beta is the parameter "stiffness"."""
 
     terms: tuple[EffectTerm, ...]
     name: str
 
+    @classmethod
+    def of(cls, potentials: Iterable[EffectTerm], name: str) -> "TangentDamping":
+        """Damping by the Hessians K of some potentials, each by the points or the freedoms of joints that the potential
+        is a function of: by other coordinates K would have a part ``dV/dx d^2x/dq^2``, which depends on the choice of
+        the coordinates q."""
+        terms = (
+            replace(term, function=Applied(stiffness_times, (term.function,)), arguments=ARGUMENTS["kinetic"])
+            for term in potentials
+        )
+        return cls(joined(terms), name)
+
     def forces(self, values, params):
         """Force on (q_s, q_f), as of `EffectTerm`."""
-
-        def energy(q):
-            return total([term({"q": q}, params) for term in self.terms])
-
-        # K v as the derivative of the gradient along v, without the matrix K
-        products = jax.jvp(jax.grad(energy), (values["q"],), (values["v"],))[1]
+        products = totals([term.forces(values, params) for term in self.terms])
         return tuple(-params[self.name]["stiffness"] * product for product in products)
 
     @property

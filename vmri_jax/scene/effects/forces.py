@@ -15,7 +15,7 @@ from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, names, number, of_time, positive, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.springs import BetweenPoints
-from vmri_jax.scene.terms import TangentDamping, joined
+from vmri_jax.scene.terms import TangentDamping
 
 
 class Gravity(Effect):
@@ -247,7 +247,8 @@ class Dashpot(BetweenPoints):
 
 
 class RayleighDamping(Effect):
-    """Rayleigh damping of the whole scene, ``F = -(alpha M + beta K(q)) v``, K the Hessian of potentials.
+    """Rayleigh damping of the whole scene, ``F = -(alpha M + beta K(q)) v``, K the Hessian of potentials by the
+    positions of points, and by the angles and displacements of joints, that they are functions of.
 
     M has the masses of points and of the centres of rigid bodies: alpha does not damp rotations.
 
@@ -297,4 +298,4 @@ class RayleighDamping(Effect):
     def terms(self, select, layout):
         terms = () if self.mass is None else super().terms(select, layout)
         damped = [term for potential in self.of for term in potential.terms(range(len(potential.elements)), layout)]
-        return terms if self.stiffness is None or not damped else (*terms, TangentDamping(joined(damped), self.name))
+        return terms if self.stiffness is None or not damped else (*terms, TangentDamping.of(damped, self.name))
