@@ -91,7 +91,8 @@ def test_a_run_does_not_see_them():
     [
         ([HUB], [sc.Controlled("hab", "torque")], "hab torque: there is no body 'hab'"),
         ([POINT], [sc.Controlled("point", "torque")], "point has no directors; a torque needs a rigid body with three"),
-        ([POINT], [sc.Controlled(("point", [1.0, 0.0]), "force")], "point"),
+        ([POINT], [sc.Controlled(("point", [1.0, 0.0]), "force")], "point is no rigid body"),
+        ([HUB], [sc.Controlled(("hub", [1.0, 0.0]), "force")], r"the point in hub has shape \(2,\)"),
         ([HUB], [sc.Controlled("hub", "torque", along=[1.0, 0.0])], r"along has shape \(2,\)"),
         ([HUB], [sc.Controlled("hub", "torque", along=[0.0, 0.0, 0.0])], "it must have a direction"),
         (

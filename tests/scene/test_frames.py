@@ -130,7 +130,7 @@ def test_frames_that_cannot_move_are_refused():
     with pytest.raises(ValueError, match=r"no joint carries the frame yoke, and it has no mass"):
         sc.Scene([frame, PLATE], [replace(tilt, between=("ground", "plate"))], coordinates="joint")
     scene = sc.Scene([frame, PLATE], [pan, tilt], coordinates="joint")
-    with pytest.raises(ValueError, match=r"by_directors: yoke have no mass"):
+    with pytest.raises(ValueError, match=r"yoke is a frame without mass.*not by directors.*For reaction forces"):
         scene.by_directors(None)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"Frame yoke: position has shape \(2,\); give \(3,\)"):
         sc.Frame("yoke", [0, 1])
@@ -149,7 +149,10 @@ def two_values(x, params):
         (lambda: sc.Gear(["shoulder", "wrist"], ratios=[1.0, 0.0]), r"none of them may be zero"),
         (lambda: sc.Gear(["shoulder", ("wrist", "slide")], ratios=[1.0, 2.0]), r"wrist leaves turn free"),
         (lambda: sc.JointCoupling(["shoulder", "wrist"], two_values), r"law returns .*\(2, 2\).*one value"),
-        (lambda: sc.JointCoupling(["shoulder", "wrist"], lambda x, params: x[0] - x[1] + 0.1), r"the equation is 0.1"),
+        (
+            lambda: sc.JointCoupling(["shoulder", "wrist"], lambda x, params: x[0] - x[1] + 0.1),
+            r"violate coupling.* 0.1;",
+        ),
         (lambda: sc.JointCoupling(["shoulder", "wrist"], lambda x: x[0]), r"law .*x, params"),
         (lambda: sc.RotorInertia("shoulder", -1.0, name="more"), r"inertia is -1.0; it must be positive"),
     ],

@@ -148,6 +148,13 @@ def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
         whole_number(f"fit: {name}", value)
 
 
+def _changed(item, attributes: Mapping):
+    """A copy of an object with other attributes, which JAX may trace: nothing is checked."""
+    item = copy(item)
+    vars(item).update(attributes)
+    return item
+
+
 class _Search:
     """The search of a fit; its programs are compiled once and run for several starts and several sets of values.
 
@@ -172,17 +179,17 @@ class _Search:
 
         @jax.jit
         def program(numbers, *arguments):
-            (starts, sigma, macro_dt), scale = numbers
-            search = copy(self)
-            search.shooting, search.scale = copy(self.shooting), scale
-            unknowns = Unknowns(dict(zip(names, map(Unknown.of, starts), strict=True)))
-            vars(search.shooting).update(unknowns=unknowns, sigma=sigma, macro_dt=macro_dt)
-            return function(search, *arguments)
+            of_unknowns, of_runs, scale = numbers
+            pairs = zip(known.items(), of_unknowns, strict=True)
+            unknowns = Unknowns({name: _changed(unknown, values) for (name, unknown), values in pairs})
+            runs = _changed(self.shooting, of_runs | {"unknowns": unknowns})
+            return function(_changed(self, {"shooting": runs, "scale": scale}), *arguments)
 
         # the names are no arguments: JAX would sort them, and the search variables are in the order of the user
-        names, unknowns = zip(*self.shooting.unknowns.unknowns.items(), strict=True)
-        starts = [unknown.numbers for unknown in unknowns]
-        return partial(program, ((starts, self.shooting.sigma, self.shooting.macro_dt), self.scale))
+        known = self.shooting.unknowns.unknowns
+        of_unknowns = [vars(unknown) for unknown in known.values()]
+        of_runs = {"sigma": self.shooting.sigma, "macro_dt": self.shooting.macro_dt}
+        return partial(program, (of_unknowns, of_runs, self.scale))
 
     def residual(self, x, args):
         """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search

@@ -156,19 +156,6 @@ class Unknown:
         if self.scale is not None and not np.all(self.scale > 0):
             raise Refused(f"Unknown: scale is {self.scale}; it must be positive.")
 
-    @property
-    def numbers(self) -> tuple:
-        """Start, bounds and scale."""
-        return self.start, self.lower, self.upper, self.scale
-
-    @classmethod
-    def of(cls, numbers: tuple) -> "Unknown":
-        """The unknown with these `numbers`, which JAX may trace."""
-        unknown = object.__new__(cls)
-        for name, value in zip(("start", "lower", "upper", "scale"), numbers, strict=True):
-            object.__setattr__(unknown, name, value)
-        return unknown
-
     def at(self, u):
         """The parameter for a search variable of the same shape; 0 is the start."""
         if self.lower is None and self.upper is None:

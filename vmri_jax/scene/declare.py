@@ -65,6 +65,17 @@ def _listed(argument: Any) -> tuple[Any, ...]:
     return tuple(argument) if isinstance(argument, Iterable) and not is_entry(argument) else (argument,)
 
 
+def items_of(about: str, argument: Any, kind: type, expected: str) -> tuple[Any, ...]:
+    """The items of a list of objects of one class, which messages call `expected`; `about` begins messages."""
+    if isinstance(argument, kind) or not isinstance(argument, Iterable):
+        raise Refused(f"{about} is {argument!r}; give a list.")
+    items = tuple(argument)
+    for item in items:
+        if not isinstance(item, kind):
+            raise Refused(f"{about} has {item!r}; each must be {expected}.")
+    return items
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A field with numbers that the function of an effect gets as an array.

@@ -10,14 +10,12 @@ from typing import Any, ClassVar, Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.constraints import START
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
-from vmri_jax.mechanics.slopes import ScaledRows, Slopes
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES, Bindable
 from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving, weights_of
@@ -128,7 +126,7 @@ class Effect(Bindable):
             about = f"{self.name}: {name}"
             self.check_of_time(about, shape_of(about, function, jnp.zeros(()), self.params_of_time))
         self.check_parameters()
-        check_function(self, moved)
+        self.check_function()
         if self.kind == "constraint" and not moved:
             self.check_start()
 
@@ -172,6 +170,16 @@ class Effect(Bindable):
         for (body,), (end,) in zip(self.elements, self.ends, strict=True):
             if shape != (end.size,) and (shape, end.size) != ((), 1):
                 raise Refused(f"{about} returns shape {shape}; {body} has dimension {end.size}, return ({end.size},).")
+
+    def check_function(self) -> None:
+        """Refuse a function of the user with a wrong value; it gets each group of equal elements, as the terms of the
+        system do."""
+        if self.kind == "control" or getattr(self.function, "__module__", "").startswith(LIBRARY):
+            return
+        for group in self.groups():
+            *arguments, params = self.arguments_at_start(group)
+            value = shape_of(f"{self.name}: function", self.called, *jax.device_put(arguments), arrays(params))
+            _check_value(self, value, [x.shape for x in self.positions(group)], len(group))
 
     def check_parameters(self) -> None:
         """Refuse bodies at one place, parameters of another shape or sign, or that are not finite."""
@@ -246,35 +254,6 @@ class Effect(Bindable):
                     f"it starts as {measured:.12g}; give this value, move a body, or let the scene do so, project=True"
                 )
                 self.require(agrees, f"{name} of {'-'.join(map(label_of, element))}", f"{kept:g}", expected)
-
-
-def check_function(effect: Any, moved: bool) -> None:
-    """Refuse a function of the user with a wrong value, and a constraint that the start violates unless `moved`.
-
-    The function gets each group of equal elements, as the terms of the system do.
-    """
-    if effect.kind == "control" or getattr(effect.function, "__module__", "").startswith(LIBRARY):
-        return
-    for group in effect.groups():
-        *arguments, params = effect.arguments_at_start(group)
-        arguments = *jax.device_put(arguments), arrays(params)
-        value = shape_of(f"{effect.name}: function", effect.called, *arguments)
-        _check_value(effect, value, [x.shape for x in effect.positions(group)], len(group))
-        if effect.kind == "constraint" and not moved and is_concrete(arguments):
-            rows = _rows(effect.called, *arguments)
-            if np.any(np.abs(rows.values) > rows.allowed(START)):
-                raise Refused(
-                    f"{effect.name}: the positions at the start violate this constraint by "
-                    f"{np.abs(rows.values).max():.3g}; move the bodies, or let the scene do so, Scene(..., "
-                    "project=True)."
-                )
-
-
-def _rows(constraint, *arguments) -> ScaledRows:
-    """The `ScaledRows` of a constraint of positions, its last argument but one."""
-    *before, q, params = arguments
-    flat, by_role = ravel_pytree(q)
-    return Slopes.of(lambda flat: jnp.ravel(constraint(*before, by_role(flat), params)), flat).scaled(weights=1.0)
 
 
 def _check_value(effect: Any, value: Any, sizes: list[tuple[int, ...]], count: int) -> None:

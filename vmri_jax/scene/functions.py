@@ -3,7 +3,8 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -18,10 +19,11 @@ from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.slots import Computed
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.mechanics.terms import KINDS, POSITIONS, VELOCITIES
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import Layout
 from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.sorting import HOMES, Placed, Sorting, rows_of
-from vmri_jax.scene.terms import joined, total, totals
+from vmri_jax.scene.terms import joined, total
 
 IMPLIED = Computed("implied")
 """Key of params that holds the sizes of the dropped rows."""
@@ -69,7 +71,7 @@ class _OfTerms:
 
     def forces_on(self, q_s, q_f, params, forces):
         """Generalised forces on (q_s, q_f) of the sum F of forces on the coordinates of bodies: ``(dQ/dq)^T F``."""
-        return jax.vjp(self.bodies(params), q_s, q_f)[1](totals(forces))
+        return jax.vjp(self.bodies(params), q_s, q_f)[1](total(forces))
 
 
 class PotentialEnergy(_OfTerms):
@@ -150,6 +152,21 @@ FUNCTIONS: dict[str, Any] = {
     "force": TotalForce,
 }
 """For each kind of a function of `System`, the class that makes it of its terms."""
+
+
+def check_names(names: Iterable[str], effects: Collection[str]) -> None:
+    """Refuse names of bodies, effects and freedoms that occur twice, and names of effects that are `RESERVED`."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise Refused(
+                f"Scene: the name {name!r} occurs twice among bodies, effects and freedoms of joints; give each its "
+                "own, name=..."
+            )
+    for name, content in RESERVED.items():
+        if name in effects:
+            raise Refused(
+                f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
+            )
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:

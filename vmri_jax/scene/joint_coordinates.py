@@ -113,7 +113,8 @@ def check_replaced(
 
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:
-    """Values and rates of freedoms by the keys of `Layout.freedoms`, see `Scene.with_joints`."""
+    """Values and rates of freedoms by the keys of `Layout.freedoms`: the present ones, and `starts` as of
+    `Scene.with_joints`."""
     by_key = {}
     for joint, freedom, start in _by_freedom("Scene.with_joints", effects, starts):
         name, count = joint.name, len(joint.elements)
@@ -129,7 +130,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
                     ' coordinates="joint".'
                 )
             by_key[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)
-    return with_closed_loops(sorting, by_key)
+    return {**sorting.joint_starts, **with_closed_loops(sorting, by_key)}
 
 
 def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> dict[Key, tuple[Any, Any]]:

@@ -43,7 +43,7 @@ OLDEST_VERSION = 4
 
 
 def bodies_and_effects(
-    model: Any, qpos: Any, qvel: Any, *, key: str | int | None, ignore: Collection[str], limits: str, coordinates: str
+    model: Any, qpos: Any, qvel: Any, key: str | int | None, ignore: Collection[str], limits: str, coordinates: str
 ) -> tuple[list[RigidBody | Frame], list[Effect]]:
     """Bodies and effects of the scene of a model, see `Scene.from_mujoco`."""
     try:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
-from vmri_jax.mechanics.constraints import RANK, rank_of
+from vmri_jax.mechanics.constraints import RANK, ROUNDING, START, rank_of
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import Key
 from vmri_jax.scene.body import Bodies, listed
@@ -71,12 +71,22 @@ def sort_with_loops(
         tied |= more
 
 
-def check_constraints(sorting: Sorting) -> None:
-    """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast
-    bodies cannot satisfy."""
+def check_constraints(sorting: Sorting, moved: bool) -> None:
+    """Refuse constraints that the start violates, unless the scene moves the bodies onto them, redundant ones, dropped
+    rows that do not follow from the others, and constraints that the fast bodies cannot satisfy."""
     rows = ConstraintRows.of(sorting)
     if rows is None:
         return
+    violations = np.abs(rows.evaluate(0.0, sorting.assembled)[0])
+    # far from the origin positions are rounded by more than a part of the extent of the scene
+    reach = np.abs(rows.jacobian).sum(axis=1) * np.abs(sorting.of_bodies("coordinates")).max()
+    violated = np.flatnonzero(violations > START * rows.sizes + ROUNDING * np.finfo(float).eps * reach)
+    if violated.size and not moved:
+        raise Refused(
+            f"Scene: the positions at the start violate {rows.rows[violated[0]].name} by "
+            f"{violations[violated[0]]:.3g}; move the bodies, change numbers of this constraint, or let the scene move "
+            "the bodies, project=True."
+        )
     if opening := _opening_in_words(rows):
         raise Refused(f'Scene: redundant="drop" would change the motion: {opening}.')
     macro, micro = (rows.numbers(home) for home in HOMES)

@@ -1,6 +1,5 @@
 """Scenes: bodies and the effects between them, turned into an ordinary `System`."""
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -17,21 +16,14 @@ from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory, in_coordinates
+from vmri_jax.scene import joint_coordinates
 from vmri_jax.scene.binding import Key, bound
-from vmri_jax.scene.body import AnyBody, Frame
-from vmri_jax.scene.declare import arrays
+from vmri_jax.scene.body import AnyBody
+from vmri_jax.scene.declare import arrays, items_of
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Freedom, joint_named
-from vmri_jax.scene.functions import RESERVED, Actuation, actuation, build
-from vmri_jax.scene.joint_coordinates import (
-    along_run,
-    check_reach,
-    check_replaced,
-    check_run,
-    joint_starts,
-    with_rates,
-)
+from vmri_jax.scene.functions import Actuation, actuation, build, check_names
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, sort_with_loops
 from vmri_jax.scene.rigid import Rigidity
@@ -107,34 +99,18 @@ class Scene:
             raise Refused(f"Scene: redundant is {self.redundant!r}; it must be 'refuse' or 'drop'.")
         if self.coordinates not in ("joint", "directors", "auto"):
             raise Refused(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint', 'directors' or 'auto'.")
-        lists = (("bodies", AnyBody, "Body, RigidBody or Frame"), ("effects", Effect, "Effect"))
-        for name, kind, expected in lists:
-            items = getattr(self, name)
-            if isinstance(items, kind) or not isinstance(items, Iterable):
-                raise Refused(f"Scene: {name} is {items!r}; give a list.")
-            object.__setattr__(self, name, tuple(items))
-            for item in getattr(self, name):
-                if not isinstance(item, kind):
-                    raise Refused(f"Scene: {item!r} is among {name}; it must be {expected}.")
+        for name, kind, expected in (("bodies", AnyBody, "Body, RigidBody or Frame"), ("effects", Effect, "Effect")):
+            object.__setattr__(self, name, items_of(f"Scene: {name}", getattr(self, name), kind, expected))
         if not self.bodies:
             raise Refused("Scene: there are no bodies; give at least one.")
         freedoms = [label for branch in self.branches for label in branch.labels if label != branch.joint.name]
-        for name, count in Counter(freedoms + [item.name for item in (*self.bodies, *self.everything)]).items():
-            if count > 1:
-                raise Refused(
-                    f"Scene: the name {name!r} occurs twice among bodies, effects and freedoms of joints; give each "
-                    "its own, name=..."
-                )
-        for name, content in RESERVED.items():
-            if name in [effect.name for effect in self.effects]:
-                raise Refused(
-                    f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
-                )
+        bodies, effects = ([item.name for item in items] for items in (self.bodies, self.everything))
+        check_names([*bodies, *effects, *freedoms], effects)
         for effect in self.everything:
             effect.check(self.project)
         check_frames(self.by_name, self.branches)
-        check_constraints(self.sorting)
-        check_reach(self.sorting)
+        check_constraints(self.sorting, self.project)
+        joint_coordinates.check_reach(self.sorting)
 
     @classmethod
     def from_mujoco(
@@ -174,9 +150,7 @@ class Scene:
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # the package mujoco is an optional dependency
 
-        bodies, effects = bodies_and_effects(
-            model, qpos, qvel, key=key, ignore=ignore, limits=limits, coordinates=coordinates
-        )
+        bodies, effects = bodies_and_effects(model, qpos, qvel, key, ignore, limits, coordinates)
         return cls(bodies, effects, redundant="drop", project=True, coordinates=coordinates)
 
     @cached_property
@@ -288,7 +262,8 @@ class Scene:
                 between two nodes.
             IndexError: no such pair.
         """
-        return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.bound), run, of, pair)
+        known = joint_named("Scene.joint_motion", joint, self.bound)
+        return joint_coordinates.along_run(self.sorting, known, run, of, pair)
 
     def by_directors(self, run: Trajectory) -> Trajectory:
         """The same run with bodies described by their centres and directors, where joints have rows, multipliers and
@@ -303,18 +278,11 @@ class Scene:
             ValueError: frames without mass, which cannot move by directors; angles too far for effects that take them
                 from directors.
         """
-        frames = [body.name for body in self.bodies if isinstance(body, Frame)]
-        if frames:
-            raise Refused(
-                f"Scene.by_directors: {', '.join(frames)} have no mass, which bodies with directors need. Reaction "
-                "forces are known of scenes without frames: join bodies by Universal, Cylindrical or Planar, or put "
-                "bodies of small mass in place of the frames."
-            )
         # all bodies slow: on the micro grid, rows that the fast bodies alone cannot satisfy would be refused
         bodies = [replace(body, pace="slow") for body in self.bodies]
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
-        check_run(self.sorting, run, twin.sorting)
+        joint_coordinates.check_run(self.sorting, run, twin.sorting)
         q, v = (np.concatenate([of(name) for name in twin.places], axis=-1) for of in (run.position, run.velocity))
         return in_coordinates(run, twin, (q, q[..., :0]), (v, v[..., :0]))
 
@@ -359,7 +327,7 @@ class Scene:
         for key in changes:
             if key not in arguments:
                 raise Refused(f"Scene.replace: {name}: {unknown('argument', key, arguments)}")
-        check_replaced(name, changes, self.branches, self.joint_starts)
+        joint_coordinates.check_replaced(name, changes, self.branches, self.joint_starts)
         changed = list((items | {name: replace(items[name], **changes)}).values())
         return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])
 
@@ -381,7 +349,7 @@ class Scene:
             ValueError: no joint of this name, a joint without this freedom, rates that contradict each other or the
                 constraints.
         """
-        bodies, starts = with_rates(self.sorting, self.bound, self.system(), rates)
+        bodies, starts = joint_coordinates.with_rates(self.sorting, self.bound, self.system(), rates)
         return replace(self, bodies=bodies, joint_starts=starts)
 
     def with_joints(self, joints: Mapping[str, Any]) -> "Scene":
@@ -403,7 +371,7 @@ class Scene:
                 are not finite; a loop that does not close with these values, or whose last joint, without a coordinate,
                 would turn too far for its effects.
         """
-        return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.bound, joints)})
+        return replace(self, joint_starts=joint_coordinates.joint_starts(self.sorting, self.bound, joints))
 
     def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
         """The grid, unknowns, evaluations and computing time that every body and effect adds to a macro step of a

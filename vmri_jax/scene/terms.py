@@ -282,11 +282,6 @@ def pick(values, select: Sequence[int]):
     return library(values).stack([values[i] for i in select])
 
 
-def total(values: Sequence):
-    """Sum of one or more arrays."""
-    return reduce(add, values)
-
-
-def totals(pairs: Sequence):
-    """Sum of pairs (slow, fast): the pair of the sums."""
-    return tuple(total(parts) for parts in zip(*pairs, strict=True))
+def total(values: Sequence) -> Any:
+    """Sum of one or more arrays, or of pairs (slow, fast) of arrays."""
+    return jax.tree.map(lambda *parts: reduce(add, parts), *values)

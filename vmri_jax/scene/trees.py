@@ -152,8 +152,9 @@ def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
             continue
         if not branches:
             raise Refused(
-                f"Scene: {name} is a frame without mass, which moves with joints alone; give the scene"
-                ' coordinates="joint".'
+                f"Scene: {name} is a frame without mass, which moves with joints alone, not by directors; give the "
+                'scene coordinates="joint". For reaction forces, join bodies by Universal, Cylindrical or Planar, or '
+                "put a body of small mass in place of the frame."
             )
         if name not in hanging or name not in carrying:
             lack = f"no joint carries the frame {name}" if name not in hanging else f"the frame {name} carries no body"

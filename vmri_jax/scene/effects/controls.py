@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import AXES
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of, weights_of
+from vmri_jax.scene.body import body_of, end_of, entry, is_entry, label_of, weights_of
 from vmri_jax.scene.declare import names, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
@@ -98,15 +98,12 @@ class Controlled(Effect):
         super().check_bodies()
         name = entry(self.body)
         body = body_of(self.by_name, name)
+        end_of(self.by_name, name)  # refuses a point in a body that has none
         if self.along is not None:
             self.require(
                 real_array(f"{self.name}: along", self.along).any(), "along", self.along, "it must have a direction"
             )
         directors = body.size // 3 - 1 if body.rigid else 0
-        if isinstance(name, Attachment) and not body.rigid:
-            raise Refused(
-                f"{self.name}: {name} is a point; only rigid bodies have points in them. Give the name alone."
-            )
         if (self.load == "torque" or self.axes == "body") and directors < 3:
             load = "a torque" if self.load == "torque" else "axes of its own"
             directors_of_body = f"{directors} of three directors" if body.rigid else "no directors"

@@ -304,13 +304,6 @@ class JointCoupling(OfFreedoms):
             count, expected = len(joint.elements), "give each pair a joint of its own name"
             self.require(count == 1, f"the number of pairs of {joint.name}", count, expected)
 
-    def check_start(self):
-        violation = abs(self.law(np.zeros(len(self.joints)), self.numbers()))
-        expected = (
-            "it must be zero at the positions in `bodies`, where all freedoms are zero; change it, or set project=True"
-        )
-        self.require(violation < START, "the equation", violation, expected)
-
 
 def weighted_sum(x, params):
     """``sum_i r_i x_i``."""

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
-from vmri_jax.mechanics.constraints import START
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import array, names, of_time, positive, vector
@@ -297,11 +296,3 @@ class Guide(ToPath):
     @staticmethod
     def law(line, params):
         return line
-
-    def check_start(self):
-        super().check_start()
-        distance = self.at_start(self.parameters)
-        (positions,) = self.positions(range(len(self.elements)))
-        size = abs(positions).max()
-        quantity = "the distance of the body from its point at t = 0"
-        self.require(distance <= START * library(size).maximum(size, 1.0), quantity, distance, "it must start there")
