@@ -6,7 +6,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas
 import pytest
@@ -202,7 +201,7 @@ HOW = {"scheme": vm.fully_implicit(1), "macro_dt": 0.1, "num_steps": 2, "solver"
 
 def test_transformations_keep_the_origin(swing):
     v_f = np.asarray(swing.v_f)
-    for other in (jax.tree.map(jnp.asarray, swing), jax.jit(lambda run: run)(swing), copy.deepcopy(swing)):
+    for other in (jax.device_put(swing), jax.jit(lambda run: run)(swing), copy.deepcopy(swing)):
         assert np.array_equal(other.v_f, v_f)
         assert other.names.fast_coordinates == ["bob x", "bob y"]
     both = jax.tree.map(lambda *a: np.stack(a), swing, swing)

@@ -233,8 +233,8 @@ def test_what_acts_in_a_joint_acts_on_its_coordinate():
     q_s, q_f, *_ = scene.start
     assert [q_s.tolist(), q_f.tolist()] == [[0.0], [0.0, 0.12]]
     system = scene.system()
-    assert scene.actuation is not None
-    acting = jax.jit(lambda q_f, u: (system.g(0.7, q_s, q_f), scene.actuation(q_s, q_f, u, system.params)))
+    actuation: Any = scene.actuation
+    acting = jax.jit(lambda q_f, u: (system.g(0.7, q_s, q_f), actuation(q_s, q_f, u, system.params)))
     g, push = acting(q_f + np.array([0.3, 0]), np.array([2.0]))
     np.testing.assert_allclose(g, 0.3 - 0.5 * np.sin(0.7), atol=1e-15)
     np.testing.assert_allclose(np.concatenate(push), [2.0, 0.0, 0.0], atol=1e-15)

@@ -91,7 +91,7 @@ class Transcription(eqx.Module):
         return state_of(z, self.start.t + k * self.macro_dt, self.start)
 
     @property
-    def z_start(self) -> jax.Array:
+    def z_start(self):
         """The first state, (n,)."""
         return phase_vector(self.start)
 

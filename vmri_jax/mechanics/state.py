@@ -175,9 +175,9 @@ def _checked_start(known: Known, project: bool, tolerance: float) -> tuple[State
     if not system.has_constant_mass:  # before the projection, which divides by the masses
         check_system(system, q_s, q_f)
         check_mass(system, q_s, q_f)
-    # copies: JAX takes the memory of arrays of NumPy as it is, and users go on writing to theirs; by NumPy, since the
-    # first copy by JAX of each shape is a program
-    state, violation = jax.tree.map(lambda a: jnp.asarray(np.array(a)), _start(known.tree, project))
+    # copies: JAX takes the memory of arrays of NumPy as it is, and users go on writing to theirs; by NumPy, since for
+    # `jnp.array` the first array of each shape is a program
+    state, violation = jax.device_put(jax.tree.map(np.array, _start(known.tree, project)))
     advice = (
         "projection did not reach the constraints; start closer to them."
         if project

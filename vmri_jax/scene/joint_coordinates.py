@@ -65,10 +65,10 @@ def with_rates(
         pairs, about = range(len(joint.elements)), f"Scene.with_rates: the rate of {joint.name}"
         numbers = for_pairs(about, number, len(pairs), "one number")
 
-        # with one rate of the bodies for each coordinate of the scene: the row dx/dq
-        along = {name: of_bodies[columns[name]].T for name in moving(chain(*joint.elements))}
-        there = {name: np.broadcast_to(bodies[columns[name]], rates.shape) for name, rates in along.items()}
-        rows.append(np.stack([joint.value_and_rate(freedom, i, there, along)[1] for i in pairs]))
+        # dx/dQ of the coordinates Q of bodies: the rates of x along unit vectors
+        along = {name: np.eye(bodies.size)[:, columns[name]] for name in moving(chain(*joint.elements))}
+        there = {name: np.broadcast_to(bodies[columns[name]], unit.shape) for name, unit in along.items()}
+        rows.append(np.stack([joint.value_and_rate(freedom, i, there, along)[1] for i in pairs]) @ of_bodies)
         values.append(np.broadcast_to(numbers, (len(pairs),)))
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(mass_and_momentum(system, *start)[0])  # M = R R^T
