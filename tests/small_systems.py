@@ -5,11 +5,12 @@ Systems of functions have two slow and two fast variables in the plane where the
 """
 
 import jax.numpy as jnp
+import numpy as np
 
 import vmri_jax as vm
 from vmri_jax.scene import Anchor, Body, Gravity, RigidBody, RigidLink, Scene, Spring
 
-NONE = jnp.zeros(0)
+NONE = np.zeros(0)
 STIFF = 400.0
 """Stiffness of the fast potentials; frequency 20 with unit mass."""
 
@@ -63,17 +64,17 @@ def drive(t, q_s, q_f, v_s, v_f, params):
 
 
 PARAMS = {"soft": 4.0, "stiff": STIFF}
-SLOW, FAST = jnp.array([1.0, 0.0]), jnp.array([0.02, -0.01])
+SLOW, FAST = np.array([1.0, 0.0]), np.array([0.02, -0.01])
 """Starts; the slow one lies on the circle."""
 ANGLE = 0.1
-HANGING = SLOW - jnp.array([jnp.cos(ANGLE), jnp.sin(ANGLE)])
-ACROSS = 0.5 * jnp.array([jnp.sin(ANGLE), -jnp.cos(ANGLE)])
+HANGING = SLOW - np.array([np.cos(ANGLE), np.sin(ANGLE)])
+ACROSS = 0.5 * np.array([np.sin(ANGLE), -np.cos(ANGLE)])
 """The fast end of a rod from the slow point, near the rest of its spring, and a velocity across the rod: a gentle
 motion."""
 
 
 def _system(masses, *potentials, **parts) -> vm.System:
-    return vm.System(masses, *potentials, params={name: jnp.asarray(x) for name, x in PARAMS.items()}, **parts)
+    return vm.System(masses, *potentials, params={name: np.asarray(x) for name, x in PARAMS.items()}, **parts)
 
 
 BOTH = vm.ConstantMass([2.0, 2.0], [1.0, 1.0])
@@ -112,7 +113,7 @@ def moving_constraints() -> vm.Problem:
     system = _system(
         BOTH, soft, stiff, constraint=vm.Rheonomic(moving_rod), slow_constraint=vm.Rheonomic(moving_circle)
     )
-    return vm.Problem(system, SLOW, HANGING, [0.3, 0.0], jnp.array([0.6, 0.0]) + ACROSS)
+    return vm.Problem(system, SLOW, HANGING, [0.3, 0.0], np.array([0.6, 0.0]) + ACROSS)
 
 
 def damped() -> vm.Problem:
@@ -137,7 +138,7 @@ def scene_of_points() -> Scene:
 def scene_of_rigid_bodies() -> Scene:
     return Scene(
         [
-            RigidBody("hub", 5.0, [1.0, 2.0, 2.5], jnp.zeros(3), spin=[0.1, 0.0, 0.5], pace="slow"),
+            RigidBody("hub", 5.0, [1.0, 2.0, 2.5], np.zeros(3), spin=[0.1, 0.0, 0.5], pace="slow"),
             Body("tip", 1.0, [1.2, 0.0, 0.0], pace="fast"),
         ],
         [Spring(("hub", "tip"), STIFF, 1.0)],

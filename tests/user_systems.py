@@ -1,6 +1,7 @@
 """Systems as users write them: plain functions of slow and fast variables."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax import ConstantMass, Problem, Rheonomic, State, System, initial_state
 
@@ -19,9 +20,9 @@ def two_oscillators(kappa=25.0, omega=50.0) -> Problem:
         ConstantMass([1.0], [1.0]),
         slow_potential=soft_coupling,
         fast_potential=stiff_spring,
-        params={"kappa": jnp.asarray(kappa), "omega": jnp.asarray(omega)},
+        params={"kappa": np.asarray(kappa), "omega": np.asarray(omega)},
     )
-    one = jnp.ones(1)
+    one = np.ones(1)
     return Problem(system, one, one / omega, 0 * one, one)
 
 
@@ -38,9 +39,9 @@ def arms_weight(q_s, q_f, params):
 
 
 def double_pendulum() -> Problem:
-    params = {"masses": jnp.array([10.0, 0.1]), "lengths": jnp.array([1.0, 0.02]), "gravity": jnp.asarray(9.81)}
+    params = {"masses": np.array([10.0, 0.1]), "lengths": np.array([1.0, 0.02]), "gravity": np.asarray(9.81)}
     system = System(arms_kinetic, slow_potential=arms_weight, params=params)
-    return Problem(system, jnp.array([1.0]), jnp.array([1.3]), jnp.array([0.0]), jnp.array([2.0]))
+    return Problem(system, np.array([1.0]), np.array([1.3]), np.array([0.0]), np.array([2.0]))
 
 
 # --- everything at once ----------------------------------------------------------------------------------------------
@@ -78,13 +79,11 @@ def bent_system() -> System:
         constraint=bent_constraint,
         slow_constraint=bent_slow_constraint,
         force=bent_force,
-        params={"k": jnp.asarray(40.0), "b": jnp.asarray(0.1), "length": jnp.asarray(2.0)},
+        params={"k": np.asarray(40.0), "b": np.asarray(0.1), "length": np.asarray(2.0)},
     )
 
 
-FULL_MASS = ConstantMass(
-    jnp.array([[5.0, 1.0], [1.0, 4.0]]), jnp.array([[1.0, 0.2, 0], [0.2, 1.0, 0.1], [0, 0.1, 2.0]])
-)
+FULL_MASS = ConstantMass(np.array([[5.0, 1.0], [1.0, 4.0]]), np.array([[1.0, 0.2, 0], [0.2, 1.0, 0.1], [0, 0.1, 2.0]]))
 """For two slow and three fast variables."""
 
 
@@ -105,7 +104,7 @@ def tilted(q_s, q_f, params):
 
 def tied_system() -> tuple[System, State]:
     """Coupling constraints, one of them moved, and slow ones; and a consistent start."""
-    system = System(FULL_MASS, tilted, constraint=Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0))
+    system = System(FULL_MASS, tilted, constraint=Rheonomic(lifted), slow_constraint=sphere, params=np.asarray(3.0))
     return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1], project=True)
 
 
@@ -120,9 +119,9 @@ def rod(q_s, q_f, params):
 
 def cart() -> Problem:
     """The cart is slow, the bob fast; the parameter is the stiffness of the spring."""
-    system = System(ConstantMass([3.0], [1.0, 1.0]), cart_spring, constraint=rod, params=jnp.asarray(20.0))
-    zero = jnp.zeros(1)
-    return Problem(system, zero, jnp.array([0.0, -0.5]), zero, jnp.array([0.4, 0.0]))
+    system = System(ConstantMass([3.0], [1.0, 1.0]), cart_spring, constraint=rod, params=np.asarray(20.0))
+    zero = np.zeros(1)
+    return Problem(system, zero, np.array([0.0, -0.5]), zero, np.array([0.4, 0.0]))
 
 
 # --- a pendulum: a point on a rod, at rest or on a pivot that swings, in still air

@@ -260,6 +260,6 @@ def test_a_start_of_another_duration():
 
 
 def test_a_border_has_the_mean_of_its_controls():
-    u = jnp.array([[1.0], [5.0]])
+    u = np.array([[1.0], [5.0]])
     for t, control in ((2.1, 1.0), (2.5, 3.0), (2.5 + 1e-9, 3.0), (2.9, 5.0), (1.0, 1.0), (9.0, 5.0)):
         assert held(t, u, 2.0, 0.5)[0] == pytest.approx(control)

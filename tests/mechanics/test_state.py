@@ -38,12 +38,13 @@ def test_a_problem_takes_plain_lists():
 def test_momenta_of_a_mass_matrix(fpu):
     matrix = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.1], [0.0, 0.1, 3.0]])
     system = fpu.system.replace(kinetic=ConstantMass(matrix, 2 * np.ones(3)))
-    v_s, v_f = jnp.array([1.0, 2.0, 3.0]), jnp.ones(3)
+    v_s, v_f = np.array([1.0, 2.0, 3.0]), np.ones(3)
     state = initial_state(system, fpu.q_s, fpu.q_f, v_s, v_f, t=2.0)
     assert np.allclose(state.p_s, matrix @ v_s, rtol=1e-15)
     assert np.allclose(state.p_f, 2 * v_f, rtol=1e-15)
     assert float(state.t) == 2.0
-    assert largest_difference(system.kinetic.velocity(state.p_s, state.p_f)[0], v_s) < 1e-14
+    back = jax.jit(ConstantMass.velocity)(system.kinetic, state.p_s, state.p_f)
+    assert largest_difference(back[0], v_s) < 1e-14
 
 
 def test_legendre_transform_of_a_kinetic_function():
@@ -67,25 +68,25 @@ def test_momenta_are_projected_onto_the_hidden_constraints(name, request):
     rng = np.random.default_rng(1)
     v_s, v_f = rng.normal(size=problem.q_s.shape), rng.normal(size=problem.q_f.shape)
     state = initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f, project=True)
-    assert float(residual_of(problem.system, state)[1]) < 1e-12  # measured 1.5e-13
-    raw = jax.jit(legendre)(problem.system, problem.q_s, problem.q_f, v_s, v_f)
-    residual = residual_of(problem.system, State(0.0, problem.q_s, problem.q_f, *raw))
-    assert float(residual[1]) > 0.1
+    assert np.asarray(residual_of(problem.system, state))[1] < 1e-12  # measured 1.5e-13
+    raw = jax.device_get(jax.jit(legendre)(problem.system, problem.q_s, problem.q_f, v_s, v_f))
+    residual = np.asarray(residual_of(problem.system, State(np.zeros(()), problem.q_s, problem.q_f, *raw)))
+    assert residual[1] > 0.1
     # the correction is along the constraint normals: G^T mu
     jacobians = jax.jit(lambda *q: jax.jacrev(problem.system.constraints, argnums=(1, 2))(0.0, *q))
     jacobian = np.concatenate(jacobians(problem.q_s, problem.q_f), axis=1)
     correction = np.concatenate([raw[0] - state.p_s, raw[1] - state.p_f])
     mu = np.linalg.lstsq(jacobian.T, correction, rcond=None)[0]
     assert np.abs(jacobian.T @ mu - correction).max() < 1e-12
-    again = projected(problem.system, state)
-    assert largest_difference(again[0], state.p_s) < 1e-12
+    momenta = np.concatenate([state.p_s, state.p_f])
+    assert largest_difference(np.concatenate(projected(problem.system, state)[:2]), momenta) < 1e-12
 
     def kinetic(q_s, q_f, v_s, v_f, params):
         return problem.system.kinetic(q_s, q_f, v_s, v_f, params)
 
     of_function = problem.system.replace(kinetic=kinetic)
-    p_s, p_f, *_ = projected(of_function, State(0.0, problem.q_s, problem.q_f, *raw))
-    assert largest_difference(jnp.append(p_s, p_f), jnp.append(state.p_s, state.p_f)) < 1e-11
+    of_raw = projected(of_function, State(np.zeros(()), problem.q_s, problem.q_f, *raw))
+    assert largest_difference(np.concatenate(of_raw[:2]), momenta) < 1e-11
 
 
 def test_velocities_against_a_constraint_are_said_or_refused():
@@ -95,7 +96,7 @@ def test_velocities_against_a_constraint_are_said_or_refused():
     def start(radial: float, **options):
         return initial_state(pendulum, [], [1.0, 0.0], [], [radial, 1.0], **options)
 
-    pendulum = System(ConstantMass(jnp.zeros(0), jnp.ones(2)), constraint=constraint)
+    pendulum = System(ConstantMass([], [1.0, 1.0]), constraint=constraint)
     with pytest.raises(ValueError, match=r"differ by 44.72% .* Correct the velocities, or pass project=True"):
         start(0.5)  # 0.5 / sqrt(1.25)
     with pytest.warns(UserWarning, match=r"differ by 0.10%"):
@@ -112,7 +113,7 @@ def test_velocities_against_a_constraint_are_said_or_refused():
 def test_moving_constraints_say_that_they_change_a_start_at_rest():
     """A winch pulls the second coordinate at speed 2; a start at rest cannot fit, one with another speed is refused."""
     winds = Rheonomic(lambda t, q_s, q_f, params: jnp.array([q_f[1] - 2.0 * t]))
-    winch = System(ConstantMass(jnp.zeros(0), jnp.ones(2)), constraint=winds)
+    winch = System(ConstantMass([], [1.0, 1.0]), constraint=winds)
 
     def start(*v_f, **options):
         return initial_state(winch, [], [1.0, 0.0], [], v_f, **options)
@@ -143,11 +144,10 @@ def test_projection_repairs_positions(tsp):
     with pytest.raises(ValueError, match=r"violate constraint, row 0, by 2.050e-01 .*pass project=True"):
         initial_state(tsp.system, tsp.q_s, q_f, tsp.v_s, tsp.v_f)
     state = initial_state(tsp.system, tsp.q_s, q_f, tsp.v_s, tsp.v_f, project=True)
-    residual = constraint_residual(tsp.system, state)
-    assert float(jnp.max(residual)) < 1e-13
+    assert np.asarray(residual_of(tsp.system, state)).max() < 1e-13
     # nearest in the mass metric: masses 1 and 100 at the ends of the rod share 0.1 as 100 : 1 (about)
-    assert float(state.q_f[1] - q_f[1]) == pytest.approx(-0.1 * 100 / 101, rel=0.01)
-    assert float(state.q_s[1]) == pytest.approx(0.1 / 101, rel=0.01)
+    assert np.asarray(state.q_f)[1] - q_f[1] == pytest.approx(-0.1 * 100 / 101, rel=0.01)
+    assert np.asarray(state.q_s)[1] == pytest.approx(0.1 / 101, rel=0.01)
     system = tsp.system.replace(constraint=lambda q_s, q_f, params: jnp.sum(q_f**2, keepdims=True) + 1.0)
     with pytest.raises(ValueError, match="projection did not reach the constraints; start closer"):
         initial_state(system, tsp.q_s, tsp.q_f, tsp.v_s, tsp.v_f, project=True)
@@ -185,7 +185,7 @@ def the_same_twice(q_s, q_f, params):
 
 
 def test_more_constraints_than_variables_are_refused():
-    one = jnp.ones(1)
+    one = np.ones(1)
     kinetic = double_pendulum().system.params
     system = System(arms_kinetic, constraint=two_constraints, params=kinetic)
     with pytest.raises(ValueError, match="constraint returns 2 values for 1 fast variables"):
@@ -197,7 +197,7 @@ def test_more_constraints_than_variables_are_refused():
 
 def test_redundant_constraints_are_refused():
     system = bent_system().replace(constraint=the_same_twice, slow_constraint=None)
-    q_s, q_f = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
+    q_s, q_f = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     with pytest.raises(ValueError, match=r"rows \[0, 1\] of constraint depend on each other: 2 rows have rank 1 in"):
         initial_state(system, q_s, q_f, q_s, q_f)
 
@@ -219,16 +219,15 @@ def soft_and_coupled(q_s, q_f, params):
 def test_velocity_of_a_kinetic_energy_that_is_not_quadratic(kinetic, v):
     system = System(kinetic, slow_potential=soft_and_coupled)
     state = initial_state(system, [0.0], [0.1], [v], [0.5])
-    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
-    assert float(v_s[0]) == pytest.approx(v, rel=1e-13)
-    assert float(v_f[0]) == pytest.approx(0.5, rel=1e-13)
+    found = jax.jit(velocity)(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    np.testing.assert_allclose(np.concatenate(found), [v, 0.5], rtol=1e-13)
 
 
 def test_relativistic_run_keeps_its_energy_band():
     system = System(relativistic_kinetic, slow_potential=soft_and_coupled)
     state = initial_state(system, [0.0], [0.1], [0.9], [0.0])
     run = simulate(system, fully_implicit(4), state, macro_dt=0.02, num_steps=500)
-    assert float(jnp.abs(run.energy - run.energy[0]).max()) < 5e-4  # measured 4e-5 with a stiff spring besides
+    assert np.abs(run.energy - run.energy[0]).max() < 5e-4  # measured 4e-5 with a stiff spring besides
 
 
 def test_velocities_may_be_traced_where_the_kinetic_energy_is_a_function():

@@ -15,7 +15,7 @@ from vmri_jax.mechanics.structure import (
     has_diagonal_hessian,
 )
 
-Q = jnp.linspace(0.5, 1.5, 4)
+Q = np.linspace(0.5, 1.5, 4)
 
 
 def nested(q):
@@ -45,11 +45,11 @@ def test_hessians(function, diagonal, constant):
     assert has_diagonal_hessian(function, Q) is diagonal
     assert has_constant_hessian(function, Q) is constant
     of = jax.jit(jax.hessian(function))
-    hessian = of(Q)
+    hessian = np.asarray(of(Q))
     if diagonal:
-        assert bool(jnp.all(hessian == jnp.diag(jnp.diag(hessian))))
+        assert np.all(hessian == np.diag(np.diag(hessian)))
     if constant:
-        assert bool(jnp.allclose(hessian, of(2 * Q)))
+        assert np.allclose(hessian, of(2 * Q))
 
 
 def test_constant_hessian_of_several_arguments():
@@ -91,7 +91,7 @@ def test_curved_directions(function, rank, curved):
     assert directions.shape == (rank, 4)
     assert directions.any(axis=0).tolist() == curved
     beside = np.eye(4) - np.linalg.pinv(directions) @ directions
-    hessian = jax.jit(jax.hessian(function))(Q**2)
+    hessian = np.asarray(jax.jit(jax.hessian(function))(Q**2))
     assert np.abs(hessian @ beside).max() <= 1e-14 * np.abs(hessian).max()
 
 

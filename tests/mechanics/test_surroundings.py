@@ -455,7 +455,7 @@ def of_run(run):
 def test_quantities_that_ensembles_keep_say_what_their_functions_say_now():
     quantities = [quantity(f"{__name__}:of_run")]
     run = vm.simulate(problem(), SCHEME, **STEPS)
-    lanes = jax.tree.map(lambda a: jnp.asarray(a)[None], run)
+    lanes = jax.device_put(jax.tree.map(lambda a: np.asarray(a)[None], run))
     for here.STRENGTH in (1.0, 2.0):
         np.testing.assert_array_equal(of_lanes(quantities, lanes)["of_run"][0], here.STRENGTH * run.q_s[-1])
 

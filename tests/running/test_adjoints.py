@@ -141,19 +141,28 @@ def test_where_masses_fail_exact_matrices_are_differentiated(in_parts):
 
 def test_lanes_of_gradients(in_parts):
     cost, at = simple_cost("kicks")
-    starts = jnp.stack([at, 1.1 * at])
+    starts = np.stack([at, 1.1 * np.asarray(at)])
     expected = simple_gradient("kicks")(starts[1])[1]
     in_parts()
     lanes = jax.jit(jax.vmap(jax.grad(cost)))(starts)
     np.testing.assert_allclose(lanes[1], expected, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize(("second", "steps"), [(jax.jacrev, "solved"), (jax.jacfwd, "kicks")])
+def reverse(gradient):
+    return jax.grad(lambda p_f: gradient(p_f)[0])
+
+
+def forward(gradient):
+    return lambda p_f: jax.jvp(gradient, (p_f,), (np.ones(1),))[1]
+
+
+@pytest.mark.parametrize(("second", "steps"), [(reverse, "solved"), (forward, "kicks")])
 def test_second_derivatives(second, steps, in_parts):
     """Reverse over reverse, and forward over reverse in parts; `tests/verification/test_gradients.py` has steps under
     forward over forward."""
     program, (cost, at), h = simple_gradient(steps), simple_cost(steps), 1e-5
-    expected = jnp.stack([(program(at + h * e)[1] - program(at - h * e)[1]) / (2 * h) for e in jnp.eye(at.size)])
+    at = np.asarray(at)  # of a single fast variable
+    expected = (program(at + h)[1] - np.asarray(program(at - h)[1])) / (2 * h)
     if steps == "kicks":
         in_parts()
     np.testing.assert_allclose(jax.jit(second(jax.grad(cost)))(at), expected, rtol=1e-6, atol=1e-8)

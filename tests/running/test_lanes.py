@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,9 +21,9 @@ from tests.user_systems import cart, two_oscillators
 def spread(problem, lanes: int) -> vm.State:
     """States that differ in their velocities."""
     state = problem.state()
-    scale = 1 + 0.02 * jnp.arange(lanes)[:, None]
-    q_s, q_f = jnp.tile(state.q_s, (lanes, 1)), jnp.tile(state.q_f, (lanes, 1))
-    return vm.State(jnp.zeros(lanes), q_s, q_f, scale * state.p_s, scale * state.p_f)
+    scale = 1 + 0.02 * np.arange(lanes)[:, None]
+    q_s, q_f = np.tile(state.q_s, (lanes, 1)), np.tile(state.q_f, (lanes, 1))
+    return vm.State(np.zeros(lanes), q_s, q_f, scale * np.asarray(state.p_s), scale * np.asarray(state.p_f))
 
 
 SYSTEMS = PROBLEMS | {"chain": partial(vm.systems.fermi_pasta_ulam, 1), "pendulum": swinging, "cart": cart}
@@ -67,7 +66,7 @@ def test_lanes_equal_single_runs(way):
         assert largest_difference(batch.t[lane], single(way, lane).t) == 0
 
 
-STEPS, OMEGAS = jnp.array([0.01, 0.02, 0.03]), jnp.array([30.0, 50.0, 60.0])
+STEPS, OMEGAS = np.array([0.01, 0.02, 0.03]), np.array([30.0, 50.0, 60.0])
 SCHEME_OF_THREE, MARCH = vm.fully_implicit(2), vm.Solver("masses")
 
 
@@ -110,11 +109,11 @@ def test_step_sizes_and_params_per_lane(chain, three):
 
 def test_a_failing_lane_leaves_the_others_alone(chain, three):
     states = spread(chain, 3)
-    states = vm.State(states.t, states.q_s.at[1, 0].set(1e200), states.q_f, states.p_s, states.p_f)
+    states.q_s[1, 0] = 1e200
     with pytest.warns(vm.FailedLanesWarning, match=r"1 of 3 lanes failed .* lane 1, at macro step 0 \(NON_FINITE\)"):
         batch = batch_of_three(chain, states)
     assert np.asarray(batch.failed_at).tolist() == [-1, 0, -1]
-    assert bool(jnp.all(jnp.isnan(batch.q_f[1, 1:])))
+    assert np.isnan(batch.q_f[1, 1:]).all()
     assert largest_difference(batch.q_f[2], three.q_f[2]) == 0
 
 
@@ -135,7 +134,7 @@ def test_vmap_of_simulate_equals_the_loop():
         state = vm.initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
         return until_failure(system, scheme, state, macro_dt=macro_dt, solver=MARCH, **RUN)
 
-    batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)
+    batch = jax.device_get(jax.jit(jax.vmap(go))(v_s, v_f, steps, params))
     assert batch.q_f.shape == (LANES, 5, problem.q_f.size)
     assert np.flatnonzero(~np.asarray(batch.success)).tolist() == [BAD]
     assert vm.Result(int(batch.result[BAD])) in (vm.Result.NON_FINITE, vm.Result.DIVERGED, vm.Result.STAGNATED)
@@ -246,7 +245,7 @@ def test_a_lane_off_the_constraints_has_failed():
     name, scheme, macro_dt, _ = WAYS["drift along constraints"]
     problem = SYSTEMS[name]()
     states = spread(problem, 5)
-    states = eqx.tree_at(lambda s: s.q_f, states, states.q_f.at[1].multiply(1.01))
+    states.q_f[1] *= 1.01
     run = vm.simulate_batch(problem.system, scheme, states, macro_dt=macro_dt, solver=MARCH, warn=False, **RUN)
     assert np.flatnonzero(run.result).tolist() == [1]
     assert run.result[1] == vm.Result.CONSTRAINT_VIOLATED

@@ -31,7 +31,7 @@ def on_a_rod(gravity, length):
     return vm.System(vm.ConstantMass([], [1.0, 1.0]), weight, constraint=rod, params=jnp.stack([gravity, length]))
 
 
-ONE = jnp.ones(())
+ONE = np.ones(())
 SLOW = vm.System(vm.ConstantMass([1.0], []), lambda q_s, q_f, params: params * q_s @ q_s / 2)
 FAST = vm.System(vm.ConstantMass([], [1.0]), fast_potential=fast_spring)
 CASES = {  # system, positions, scheme
@@ -110,6 +110,6 @@ def test_derivatives_outside_of_jit():
 def test_prepared_runs_and_batches():
     problem, scheme = vm.Problem(on_a_rod(9.81 * ONE, ONE), [], [0.6, -0.8]), vm.fully_explicit(1)
     prepared = vm.prepare(problem, scheme, save=vm.Save(micro=True), **STEPS)()
-    starts = jax.tree.map(lambda a: jnp.stack([a, a]), problem.state())
+    starts = jax.tree.map(lambda a: np.stack([a, a]), problem.state())
     batch = vm.simulate_batch(problem.system, scheme, starts, **STEPS)
     np.testing.assert_allclose(batch.q_f[1], prepared.q_f, atol=1e-14)

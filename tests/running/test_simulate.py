@@ -35,7 +35,7 @@ def assert_equal(a, b, tolerance=0.0):
 
 def test_times_are_computed_from_the_step_number(fpu):
     start = fpu.state()
-    state = vm.State(jnp.asarray(0.1), start.q_s, start.q_f, start.p_s, start.p_f)
+    state = vm.State(np.asarray(0.1), start.q_s, start.q_f, start.p_s, start.p_f)
     trajectory = run(fpu, state=state, num_steps=2000, save=100)
     exact = 0.1 + 100 * np.arange(21) * H
     accumulated = 0.1 + np.concatenate([[0.0], np.cumsum(np.full(2000, H))])[::100]
@@ -205,7 +205,7 @@ def watched_fast(q_f, params):
 @pytest.mark.parametrize("make", [vm.explicit_slow, vm.fully_explicit])
 def test_sweeps_trace_the_users_functions_once(fpu, make):
     def swept(kappa=25.0, alpha=0.5, macro_dt=0.01, save_every=1):
-        params = {"kappa": jnp.asarray(kappa), "omega": jnp.asarray(50.0)}
+        params = {"kappa": np.asarray(kappa), "omega": np.asarray(50.0)}
         system = fpu.system.replace(slow_potential=watched_slow, fast_potential=watched_fast, params=params)
         return vm.simulate(
             system, make(2, alpha), fpu.state(), macro_dt=macro_dt, num_steps=4 * save_every, save=save_every

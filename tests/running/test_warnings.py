@@ -111,7 +111,7 @@ def by_stream(moving, scheme, steps, out):
 
 
 def by_batch(moving, scheme, steps, out):
-    states = jax.tree.map(lambda a: jnp.stack([a] * 2), moving.state())
+    states = jax.tree.map(lambda a: np.stack([a] * 2), moving.state())
     return vm.simulate_batch(moving, scheme, states, warn=False, **steps).result[1]
 
 
@@ -124,9 +124,14 @@ def by_ensemble(moving, scheme, steps, out):
     return int(vm.open_ensemble(out)["result"].values.ravel()[1])
 
 
+@partial(jax.jit, static_argnames="num_steps")
+def traced(system, scheme, state, macro_dt, num_steps):
+    return vm.simulate(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps)
+
+
 def by_trace(moving, scheme, steps, out):
     """Nothing warns while JAX traces: the run is asked afterwards."""
-    run = jax.jit(lambda state: vm.simulate(moving.system, scheme, state, **steps))(moving.state()).of(moving)
+    run = traced(moving.system, scheme, moving.state(), steps["macro_dt"], steps["num_steps"]).of(moving)
     for concern in run.concerns():
         warnings.warn(concern, stacklevel=1)
     return run.result
@@ -195,7 +200,7 @@ def test_no_road_computes_observables_again(tmp_path):
 def test_lanes_and_runs_that_are_asked_afterwards():
     moving, scheme, macro_dt, num_steps, kind = CAUSES["pole"]
     run = vm.simulate(moving, scheme, macro_dt=macro_dt, num_steps=num_steps)
-    for asked, said in ((run, ""), (jax.tree.map(lambda a: jnp.stack([a, a]), run), "in 2 of 2 lanes")):
+    for asked, said in ((run, ""), (jax.tree.map(lambda a: np.stack([a, a]), run), "in 2 of 2 lanes")):
         assert asked[:1].concerns() == []  # a single node, which has no step
         [concern] = asked.concerns()
         assert type(concern) is kind

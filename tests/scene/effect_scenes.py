@@ -1,6 +1,7 @@
 """One small scene for every effect: the effect between a gravity and a spring that are in all of them."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax import ConstantMass, System
 from vmri_jax import scene as sc
@@ -131,10 +132,6 @@ def spring(q_f, params):
 
 def base_by_hand() -> System:
     """The system of the base, written without a scene."""
-    m = jnp.array(list(MASSES.values()))
-    return System(
-        ConstantMass(jnp.repeat(m[:1], 3), jnp.repeat(m[1:], 3)),
-        weight,
-        spring,
-        params={"g": jnp.asarray(9.81), "m": m, "k": jnp.asarray(1e4), "l": jnp.asarray(1.7)},
-    )
+    m = np.array(list(MASSES.values()))
+    params = {"g": np.asarray(9.81), "m": m, "k": np.asarray(1e4), "l": np.asarray(1.7)}
+    return System(ConstantMass(np.repeat(m[:1], 3), np.repeat(m[1:], 3)), weight, spring, params=params)

@@ -6,7 +6,6 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.projection import legendre
@@ -31,7 +30,7 @@ def mechanics(scene: Scene, start=None, t: float = 0.0) -> Mechanics:
     layout = scene.sorting.layout
     slow_and_fast = start
     if layout.kinematics is not None:
-        slow_and_fast = _of_bodies(layout.kinematics, scene.sorting.joints, *start)
+        slow_and_fast = jax.device_get(_of_bodies(layout.kinematics, scene.sorting.joints, *start))
     q, v = slow_and_fast[:2], slow_and_fast[2:]
     bodies = {
         name: tuple(np.asarray(x[part == "f"][first : first + size]) for x in (q, v))
@@ -60,15 +59,15 @@ def by_directors(scene: Scene, bodies: dict) -> tuple[Scene, tuple]:
     bodies."""
     slow = [replace(body, pace="slow") for body in scene.bodies]
     twin = replace(scene, bodies=slow, coordinates="directors", joint_starts={})
-    q, v = (jnp.concatenate([bodies[name][k] for name in twin.places]) for k in range(2))
-    none = jnp.zeros(0)
+    q, v = (np.concatenate([bodies[name][k] for name in twin.places]) for k in range(2))
+    none = np.zeros(0)
     return twin, (q, none, v, none)
 
 
 def state_by_directors(scene: Scene, bodies: dict) -> tuple[Scene, State]:
     """As `by_directors`, with the state."""
     twin, start = by_directors(scene, bodies)
-    return twin, State(jnp.zeros(()), *start[:2], *legendre(twin.system(), *start))
+    return twin, State(np.zeros(()), *start[:2], *jax.jit(legendre)(twin.system(), *start))
 
 
 def assert_same_mechanics(ours: Mechanics, theirs: Mechanics, atol: float = 1e-12) -> None:

@@ -67,7 +67,7 @@ def operations(compiled) -> Counter:
 def test_program_is_that_of_the_system_written_by_hand(function):
     state, programs = BASE.state(), []
     for system in (BASE.system(), base_by_hand()):
-        memory = plan(system, fully_explicit(5), state).init(state, 0.01)
+        memory = jax.eval_shape(plan(system, fully_explicit(5), state).init, state, 0.01)
         programs.append(jax.jit(function).lower(system, state, memory).compile())
     ours, theirs = programs
     assert sum(operations(ours).values()) > 20

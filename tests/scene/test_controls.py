@@ -1,6 +1,6 @@
 """Controls of scenes: their generalised forces, that runs do not see them, and what is refused."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
@@ -19,14 +19,15 @@ def rates_of_momenta(scene: sc.Scene, u):
     actuate = scene.actuation
     q_s, q_f, *_ = scene.start
     assert actuate is not None
-    forces = dict(zip("sf", actuate(q_s, q_f, jnp.asarray(u), scene.system().params), strict=True))
+    forces = jax.jit(lambda u: actuate(q_s, q_f, u, scene.system().params))(np.asarray(u))
+    forces = dict(zip("sf", map(np.asarray, forces), strict=True))
     positions = {"s": q_s, "f": q_f}
     found = {}
     for name, place in scene.places.items():
         if scene.by_name[name].rigid:
             at = slice(place.start, place.start + place.size)
             q, f = positions[place.part][at], forces[place.part][at]
-            found[name] = np.asarray(f[:3]), sc.angular_momentum(q, f)
+            found[name] = f[:3], sc.angular_momentum(q, f)
     return found
 
 

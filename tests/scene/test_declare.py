@@ -43,10 +43,10 @@ POINTERS = [sc.Body("a", 1.0, [1.0, 0.0], [0.0, 0.3], pace="slow"), sc.Body("b",
 def test_one_class_is_enough():
     scene = sc.Scene(POINTERS, [TorsionSpring(["a", "b"], [1.0, 4.0])])
     assert np.allclose(scene.params["torsion_springs"]["angle"], [0.0, np.pi / 2])
-    q = jnp.array([1.0, 1.0, 0.0, 2.0])
+    q = np.array([1.0, 1.0, 0.0, 2.0])
     potential = scene.system().slow_potential
     assert potential is not None
-    energy = potential(q, jnp.zeros(0), scene.params)
+    energy = potential(q, np.zeros(0), scene.params)
     assert energy == pytest.approx((np.pi / 4) ** 2 / 2)
     run = simulate(scene.system(), fully_implicit(1), scene.state(), macro_dt=0.01, num_steps=50)
     assert np.ptp(np.asarray(run.energy)) < 1e-6
@@ -197,8 +197,8 @@ def test_copies_of_the_numbers_of_bodies_are_not_changed_alone(coordinates):
 def test_the_length_of_a_normal_changes_nothing():
     contact: Any = sc.PlaneContact(point=[0.0, 0.0], normal=[0.0, 2.0], stiffness=1e3, smoothing=0.1)
     system: Any = sc.Scene([sc.Body("a", 1.0, [0.3, 0.05], pace="slow")], [contact]).system()
-    q, none = jnp.array([0.3, 0.05]), jnp.zeros(0)
+    q, none = np.array([0.3, 0.05]), np.zeros(0)
     depth = 0.1 * np.log1p(np.exp(-0.5))
     for normal in ([0.0, 2.0], [0.0, 6.0]):
-        params = system.params | {contact.name: system.params[contact.name] | {"normal": jnp.array(normal)}}
+        params = system.params | {contact.name: system.params[contact.name] | {"normal": np.array(normal)}}
         assert float(system.slow_potential(q, none, params)) == pytest.approx(1e3 / 2 * depth**2, rel=1e-12)

@@ -63,7 +63,7 @@ def test_hinged_bars_obey_the_equation_of_the_compound_pendulum():
     given = sc.JointMotion("motion", swing, {"far": 0.4})  # 0.4 t^2: at TIME the angle and rate of all bars
     scene = sc.Scene(bodies, [*effects, given], coordinates="directors")
     state = state_of(sc.Scene(moved, same, coordinates="directors"))
-    seen = accelerations(scene, replace(state, t=jnp.asarray(TIME)))
+    seen = accelerations(scene, replace(state, t=np.asarray(TIME)))
     acceleration = {}
     for body, (q, _, a) in seen.items():  # sum d_i x d_i'' / 2, about -y
         acceleration[body.removeprefix("bar ")] = -np.cross(q[3:].reshape(3, 3), a[3:].reshape(3, 3)).sum(axis=0)[1] / 2
@@ -95,8 +95,8 @@ def test_rayleigh_damping_of_a_spring_in_a_joint():
         sc.Revolute(("ground", "bar"), at=[0, 0, 0]),
     )
     effects = [hinge, sc.JointSpring(hinge.name, 3.0), sc.RayleighDamping(stiffness=0.02)]
-    system, none = sc.Scene([bar], effects, coordinates="joint").system(), jnp.zeros(0)
-    assert float(system.forces(0.0, jnp.array([0.4]), none, jnp.array([2.0]), none)[0][0]) == pytest.approx(-0.12)
+    system, none = sc.Scene([bar], effects, coordinates="joint").system(), np.zeros(0)
+    assert float(system.forces(0.0, np.array([0.4]), none, np.array([2.0]), none)[0][0]) == pytest.approx(-0.12)
 
 
 def test_rayleigh_damping_of_a_stretched_spring_leaves_a_common_rotation():

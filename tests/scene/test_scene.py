@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.scene.gallery_scenes import gallery_scene
+from tests.scene.mechanics import mechanics, values
 from vmri_jax import ConstantMass, System, compose, fully_explicit, fully_implicit, galerkin, initial_state, simulate
 from vmri_jax import scene as sc
 from vmri_jax.animation.drawing import Drawing
@@ -54,10 +55,9 @@ def test_one_effect_is_split_by_stiffness_and_pace():
     springs = sc.Spring([("a", "b"), ("d", "b"), ("b", "c"), ("c", "d")], [1e4, 1.0, 1e4, 1e4])
     scene = sc.Scene(bodies, [springs])
     assert homes(scene)["springs"] == [("slow_potential", (0, 1)), ("fast_potential", (2, 3))]
-    system, params = scene.system(), scene.params
-    q_s, q_f = jnp.array([0.1]), jnp.array([1.3, 2.5, 2.9])
-    assert system.slow_potential(q_s, q_f, params) == pytest.approx((1e4 * 0.2**2 + 0.4**2) / 2)
-    assert system.fast_potential(q_f, params) == pytest.approx((1e4 * 0.2**2 + 1e4 * 0.6**2) / 2)
+    potentials = jax.jit(System.all_potentials)(scene.system(), np.array([0.1]), np.array([1.3, 2.5, 2.9]))
+    assert float(potentials["slow"]) == pytest.approx((1e4 * 0.2**2 + 0.4**2) / 2)
+    assert float(potentials["fast"]) == pytest.approx((1e4 * 0.2**2 + 1e4 * 0.6**2) / 2)
 
 
 def test_declared_rate_wins():
@@ -103,7 +103,7 @@ def test_same_structure_is_compiled_once():
         look(scene.system(), scene.state())
     assert len(traces) == 2  # with gravity and without
     for stiffness in (1.0, 2e6):  # even where the scene would sort differently
-        params = SPRINGS.params | {"springs": SPRINGS.params["springs"] | {"stiffness": jnp.asarray(stiffness, float)}}
+        params = SPRINGS.params | {"springs": SPRINGS.params["springs"] | {"stiffness": np.asarray(stiffness)}}
         look(SPRINGS.system().replace(params=params), SPRINGS.state())
     assert len(traces) == 2
 
@@ -163,8 +163,8 @@ def test_custom_effects_are_a_function_and_one_line():
     ]
     scene = sc.Scene(bodies, [sc.Constraint(swing, "a", {"length": 1.0}), sc.Force(push, ("a", "block"), {"c": 0.5})])
     system = scene.system()
-    q_s, q_f, v = jnp.array([1.0, 1.0]), jnp.ones(4), jnp.array([1.0, 2.0])
-    assert system.g_slow(0.0, q_s).tolist() == [1.0]
+    q_s, q_f, v = np.array([1.0, 1.0]), np.ones(4), np.array([1.0, 2.0])
+    assert values(system, 0.0, q_s, q_f, v, q_f)[-1].tolist() == [1.0]
     forces = forces_of(system, 0.0, q_s, q_f, v, q_f)
     assert forces[0].tolist() == [-0.5, -1.0]
     assert forces[1].tolist() == [0.0] * 4
@@ -178,11 +178,8 @@ def test_bodies_of_different_dimension_share_an_effect_on_single_ones():
         sc.Body("c", 1.0, [1.0, 1.0], [1.0, 1.0]),
     ]
     scene = sc.Scene(bodies, [sc.Gravity(10.0), sc.LinearDamping([0.1, 0.2, 0.3])])
-    q, v = (jnp.concatenate([getattr(body, what) for body in bodies]) for what in ("position", "velocity"))
-    none = jnp.zeros(0)
-    assert scene.system().slow_potential(q, none, scene.params) == pytest.approx(10 * (2 * 5 + 3 * 7 + 1 * 1))
-    force = scene.system().forces(0.0, q, none, v, none)[0]
-    assert np.allclose(force, [-0.1, -0.2, -0.6, -0.3, -0.3])
+    assert mechanics(scene).potential == pytest.approx(10 * (2 * 5 + 3 * 7 + 1 * 1))
+    assert np.allclose(forces_of(scene.system(), 0.0, *scene.start)[0], [-0.1, -0.2, -0.6, -0.3, -0.3])
 
 
 def test_pairs_nonlinear_springs_and_dashpots_are_the_formulas():
@@ -191,7 +188,6 @@ def test_pairs_nonlinear_springs_and_dashpots_are_the_formulas():
     bodies = [sc.Body(name, 1.0, q, v) for name, q, v in zip("abcd", *points, strict=True)]
     dashpots = sc.Dashpot([("a", "b"), ("d", "b")], [0.3, 0.7])
     scene = sc.Scene(bodies, [sc.Coulomb(charges, 2.0), sc.NonlinearSpring(("a", "c"), (3.0, 0.5, 2.0), 0.7), dashpots])
-    q, v = (jnp.asarray(p.reshape(-1)) for p in points)
     expected = sum(
         2 * charges[a] * charges[b] / np.linalg.norm(points[0, i] - points[0, j])
         for i, a in enumerate("abcd")
@@ -200,15 +196,14 @@ def test_pairs_nonlinear_springs_and_dashpots_are_the_formulas():
     )
     e = np.linalg.norm(points[0, 2] - points[0, 0]) - 0.7
     expected += 3.0 * e**2 / 2 + 0.5 * e**3 / 3 + 2.0 * e**4 / 4
-    none, params = jnp.zeros(0), scene.params
-    assert scene.system().slow_potential(q, none, params) == pytest.approx(expected)
+    assert mechanics(scene).potential == pytest.approx(expected)
     force = np.zeros((4, 2))
     for a, b, c in ((0, 1, 0.3), (3, 1, 0.7)):
         n = (points[0, b] - points[0, a]) / np.linalg.norm(points[0, b] - points[0, a])
         pull = -c * ((points[1, b] - points[1, a]) @ n) * n
         force[b] += pull
         force[a] -= pull
-    assert np.allclose(forces_of(scene.system(), 0.0, q, none, v, none)[0], force.reshape(-1))
+    assert np.allclose(forces_of(scene.system(), 0.0, *scene.start)[0], force.reshape(-1))
 
 
 def test_rayleigh_damping_is_the_matrix():

@@ -82,9 +82,13 @@ def directors(angles):
 
 
 @partial(jax.jit, static_argnums=0)
-def seen(scene, angles):
-    """What the effects of a scene do to the angles: forces of potentials, forces, controls, energy of rotors, rows of
-    couplings."""
+def seen(scenes, angles):
+    """What the effects of each scene do to the angles."""
+    return [effects_on(scene, angles) for scene in scenes]
+
+
+def effects_on(scene, angles):
+    """Forces of potentials, forces, controls, energy of rotors, rows of couplings."""
     q, motions = (angles, jnp.eye(2)) if scene.branches else directors(angles)
     v, none, system = motions @ jnp.array([0.8, 0.0]), jnp.zeros(0), scene.system()
     numbers = [system.kinetic_energy(q, none, v, none) if not system.has_constant_mass else v @ v / 4]
@@ -106,11 +110,11 @@ def test_effects_know_turns_or_need_none(name):
     """In joint coordinates, and by directors within reach or without turns: the same; beyond reach NaN, which ends a
     run."""
     make, counts = EFFECTS[name]
-    joint, bodies = (wheels(make("hinge"), coordinates=kind) for kind in ("auto", "directors"))
-    assert (len(joint.branches), len(bodies.branches)) == (2, 0)
+    scenes = tuple(wheels(make("hinge"), coordinates=kind) for kind in ("auto", "directors"))
+    assert [len(scene.branches) for scene in scenes] == [2, 0]
 
     def both(angle):
-        return [np.array(seen(scene, np.array([angle, 0.2]))) for scene in (joint, bodies)]
+        return list(map(np.array, seen(scenes, np.array([angle, 0.2]))))
 
     for angle in (0.7, -2.5):
         here, there = both(angle)

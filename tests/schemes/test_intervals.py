@@ -8,14 +8,14 @@ import pytest
 
 from tests.steppers.test_linearization import SCHEMES, equations_and_unknowns
 from tests.user_systems import bent_system
-from vmri_jax import galerkin, quadrature, textbook
+from vmri_jax import galerkin, textbook
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.interval_nodes import IntervalNodes, IntervalPath
 from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative, position_nodes, velocity_nodes
-from vmri_jax.schemes.quadrature import gauss, macro, micro, radau, simpson
+from vmri_jax.schemes.quadrature import gauss, lobatto, macro, micro, midpoint, radau, simpson, trapezoidal
 
 T, H = 0.7, 0.3
 
@@ -30,8 +30,8 @@ def control_points(equations, x: Unknowns):
 
 @jax.jit
 def whole_and_cut(equations, x):
-    """The equations of the step from the textbook's action without kicks, with the momenta at its end, and those of its
-    intervals."""
+    """The equations of the step from the textbook's action without kicks, with the fast position and the momenta at
+    its end, and those of its intervals."""
     system, scheme, t, H = equations.system, equations.scheme, equations.t, equations.macro_dt
     path, h, n = control_points(equations, x), equations.micro_dt, equations.scheme.num_micro
 
@@ -54,7 +54,7 @@ def whole_and_cut(equations, x):
     g, g_slow = textbook.constraints(system, scheme, *path, t, H)
     rows = [d.at[0].add(h * p)[:-1] for d, p in zip(slots, (equations.p_s, equations.p_f), strict=True)]
     expected = Unknowns(rows[0], g_slow[1:], rows[1].reshape(x.fast.shape), g[1:].reshape(x.multiplier.shape))
-    return expected, [d[-1] / h for d in slots], Intervals(equations).residual(x)
+    return expected, (path[1][-1], *(d[-1] / h for d in slots)), Intervals(equations).residual(x)
 
 
 ALIKE = ("fully implicit", "one micro step", "gauss 2")
@@ -64,52 +64,64 @@ ALIKE = ("fully implicit", "one micro step", "gauss 2")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in SCHEMES])
 def test_intervals_add_up_to_the_step_of_the_textbook(name):
     equations, x = equations_and_unknowns(SCHEMES[name])
-    expected, (p_s, p_f), (found, (q_f, p_s_end, p_f_end)) = whole_and_cut(equations, x)
+    expected, end, (found, (q_f, p_s, p_f)) = jax.device_get(whole_and_cut(equations, x))
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-13)  # measured 8e-15
     # momenta from those at the start and all impulses: away from the solution they differ by the rows that are left
-    np.testing.assert_allclose(q_f, control_points(equations, x)[1][-1], atol=1e-14)
-    np.testing.assert_allclose(p_f_end, p_f + expected.fast.sum((0, 1)) / equations.micro_dt, atol=1e-12)
-    np.testing.assert_allclose(p_s_end, p_s + expected.slow.sum(0) / equations.micro_dt, atol=1e-12)
+    np.testing.assert_allclose(q_f, end[0], atol=1e-14)
+    np.testing.assert_allclose(p_s, end[1] + expected.slow.sum(0) / equations.micro_dt, atol=1e-12)
+    np.testing.assert_allclose(p_f, end[2] + expected.fast.sum((0, 1)) / equations.micro_dt, atol=1e-12)
+
+
+PLACED = micro(gauss(2)), micro(radau(2)), micro(simpson), macro(gauss(2)), macro(gauss(4))
 
 
 @pytest.mark.parametrize(("degree", "num_micro"), [(1, 5), (2, 1), (3, 2)])
-@pytest.mark.parametrize("placed", [micro(gauss(2)), micro(radau(2)), micro(simpson), macro(gauss(2)), macro(gauss(4))])
-def test_intervals_sample_the_path_at_the_nodes_of_the_rule(degree, num_micro, placed):
+def test_intervals_sample_the_path_at_the_nodes_of_the_rule(degree, num_micro):
     rng = np.random.default_rng(degree + 10 * num_micro)
     slow, fast = rng.normal(size=(degree + 1, 2)), rng.normal(size=(num_micro * degree + 1, 3))
-    scheme, state = galerkin(num_micro, degree), (T, slow[0], fast[0], slow[0], fast[0])
-    equations, count = StepEquations(bent_system(), scheme, *state, H), 0
-    for nodes in IntervalNodes.of(velocity_nodes(placed, num_micro, degree)):
-        for m in np.flatnonzero(nodes.has_nodes):
-            points = fast[m * degree : (m + 1) * degree + 1]
-            path = IntervalPath(slow[0], slow[1:] - slow[0], points[0], points[1:] - points[0])
-            sampled = nodes.sample(path, equations, Entries.of([True] * 2), int(m), ("t", "q_s", "q_f", "v_s", "v_f"))
-            theta, c = nodes.theta[m], nodes.c[m]
-            expected = (
-                T + theta * H,
-                lagrange_basis(degree, theta) @ slow,
-                lagrange_basis(degree, c) @ points,
-                lagrange_derivative(degree, theta) @ slow / H,
-                lagrange_derivative(degree, c) @ points * num_micro / H,
-            )
-            for got, value in zip(sampled, expected, strict=True):
-                np.testing.assert_allclose(got, value, rtol=1e-12, atol=1e-12)
-            count += len(theta)
-    assert count == len(placed.rule.nodes) * (num_micro if placed.grid == "micro" else 1)
+    system, scheme, names = bent_system(), galerkin(num_micro, degree), ("t", "q_s", "q_f", "v_s", "v_f")
+    pieces = []  # nodes of all rules, and the number of an interval that has them
+    for placed in PLACED:
+        parts = IntervalNodes.of(velocity_nodes(placed, num_micro, degree))
+        of_rule = [(nodes, int(m)) for nodes in parts for m in np.flatnonzero(nodes.has_nodes)]
+        assert sum(len(nodes.theta[m]) for nodes, m in of_rule) == len(placed.rule.nodes) * placed.copies(num_micro)
+        pieces += of_rule
+
+    @jax.jit
+    def sampled(slow, fast):
+        equations = StepEquations(system, scheme, T, slow[0], fast[0], slow[0], fast[0], H)
+        ends = fast[::degree]
+        paths = [
+            IntervalPath(slow[0], slow[1:] - slow[0], ends[m], fast[m * degree + 1 : (m + 1) * degree + 1] - ends[m])
+            for m in range(num_micro)
+        ]
+        return [nodes.sample(paths[m], equations, Entries.of([True] * 2), m, names) for nodes, m in pieces]
+
+    for (nodes, m), found in zip(pieces, sampled(slow, fast), strict=True):
+        theta, c, points = nodes.theta[m], nodes.c[m], fast[m * degree : (m + 1) * degree + 1]
+        expected = (
+            T + theta * H,
+            lagrange_basis(degree, theta) @ slow,
+            lagrange_basis(degree, c) @ points,
+            lagrange_derivative(degree, theta) @ slow / H,
+            lagrange_derivative(degree, c) @ points * num_micro / H,
+        )
+        for got, value in zip(found, expected, strict=True):
+            np.testing.assert_allclose(got, value, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("num_micro", [1, 2, 3, 4, 5])
 @pytest.mark.parametrize(
     "placed",
     [
-        micro(quadrature.midpoint),
-        micro(quadrature.simpson),
-        micro(quadrature.trapezoidal),
-        macro(quadrature.midpoint),
-        macro(quadrature.gauss(2)),
-        macro(quadrature.gauss(3)),
-        macro(quadrature.lobatto(5)),
+        micro(midpoint),
+        micro(simpson),
+        micro(trapezoidal),
+        macro(midpoint),
+        macro(gauss(2)),
+        macro(gauss(3)),
+        macro(lobatto(5)),
     ],
 )
 def test_functions_are_evaluated_at_the_nodes_of_the_rule_alone(placed, num_micro):

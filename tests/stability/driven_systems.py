@@ -45,7 +45,7 @@ def parametric(t, q_s, q_f, v_s, v_f, params):
 
 
 def mathieu(a, q, f=0.0, *, steps=32.0, stable=True) -> Driven:
-    params = {name: jnp.asarray(x) for name, x in {"a": a, "q": q, "f": f}.items()}
+    params = {name: np.asarray(x) for name, x in {"a": a, "q": q, "f": f}.items()}
     system = vm.System(vm.ConstantMass(NONE, [1.0]), force=parametric, params=params)
     return Driven(vm.Problem(system, NONE, [1e-3]), np.pi, steps, stable, stable, vm.fully_explicit(1))
 
@@ -67,7 +67,7 @@ def radio_frequency(t, q_s, q_f, v_s, v_f, params):
 def paul_trap(q, steps, stable, stable_run) -> Driven:
     """Two ions of mass 40 in a trap of 20 MHz, in micrometres and microseconds."""
     masses = vm.ConstantMass(NONE, jnp.full(6, MASS))
-    system = vm.System(masses, coulomb_and_trap, force=radio_frequency, params={"q": jnp.asarray(q)})
+    system = vm.System(masses, coulomb_and_trap, force=radio_frequency, params={"q": np.asarray(q)})
     start = [1.0, 0.5, -HALF, -0.7, 0.3, 1.05 * HALF]
     return Driven(vm.Problem(system, NONE, start), 0.05, steps, stable, stable_run, vm.fully_explicit(1))
 
@@ -80,7 +80,7 @@ def pivot_in_motion(t, q_s, q_f, v_s, v_f, params):
 def kapitza(a, stable) -> Driven:
     """Up it stands where ``a^2 1600 > 2 g``: a above 0.111."""
     masses = vm.ConstantMass(NONE, [1.0])
-    system = vm.System(masses, force=pivot_in_motion, params={"a": jnp.asarray(a)})
+    system = vm.System(masses, force=pivot_in_motion, params={"a": np.asarray(a)})
     return Driven(vm.Problem(system, NONE, [0.05]), 2 * np.pi / 40, 40, stable, stable, vm.fully_explicit(1))
 
 
@@ -95,7 +95,7 @@ def rod_in_the_lift(t, q_s, q_f, params):
 
 def lift(omega, stable) -> Driven:
     """The pendulum has frequency 3.13; a lift of twice this frequency makes it swing."""
-    params = {"omega": jnp.asarray(omega)}
+    params = {"omega": np.asarray(omega)}
     system = vm.System(
         vm.ConstantMass(NONE, [1.0, 1.0]), weight, constraint=vm.Rheonomic(rod_in_the_lift), params=params
     )
@@ -144,7 +144,7 @@ def pumped(t, q_s, q_f, v_s, v_f, params):
 def chain(omega, stable) -> Driven:
     """Two slow and four fast coordinates; the slow ones have frequency 2.23 and are pumped at twice that, or beside
     it."""
-    params = {"depth": jnp.asarray(1.0), "omega": jnp.asarray(omega)}
+    params = {"depth": np.asarray(1.0), "omega": jnp.asarray(omega)}
     masses = vm.ConstantMass([1.0, 1.0], [1.0, 1.0, 1.0, 1.0])
     system = vm.System(masses, links, bonds, force=pumped, params=params)
     problem = vm.Problem(system, [1e-3, 1e-3], [1e-4, -1e-4, 0.0, 0.0])

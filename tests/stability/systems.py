@@ -1,6 +1,7 @@
 """Small constrained systems in the plane."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax import ConstantMass, Problem, State, System, initial_state
 
@@ -23,7 +24,7 @@ def second_rod(q_s, q_f, params):
 
 def double_pendulum(gravity=10.0, stiffness=400.0) -> System:
     """Two bobs on rods of length 1, the second one tied to the ground by a spring that pulls."""
-    params = {"gravity": jnp.asarray(gravity), "stiffness": jnp.asarray(stiffness)}
+    params = {"gravity": np.asarray(gravity), "stiffness": np.asarray(stiffness)}
     return System(
         ConstantMass([5.0, 5.0], [1.0, 1.0]), weight, spring_to_the_ground, second_rod, first_rod, params=params
     )
@@ -37,4 +38,4 @@ def hanging(system: System, up: float = -1.0) -> State:
 
 def swinging() -> Problem:
     """The two bobs in motion."""
-    return Problem(double_pendulum(), *jnp.array([[0.6, -0.8], [0.6, -1.8], [0.4, 0.3], [-0.5, 0.3]]))
+    return Problem(double_pendulum(), *np.array([[0.6, -0.8], [0.6, -1.8], [0.4, 0.3], [-0.5, 0.3]]))

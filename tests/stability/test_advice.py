@@ -113,7 +113,7 @@ def test_swapped_labels_are_named_where_a_run_diverges(fpu):
 
 def test_a_state_that_is_unstable_by_itself():
     """Coupling of the wrong sign: the growth is the motion's, not the scheme's."""
-    problem, zero = linear_model(kappa=-25.0), jnp.zeros(1)
+    problem, zero = linear_model(kappa=-25.0), np.zeros(1)
     moving = advise(problem, fully_explicit(1), macro_dt=0.01)
     assert "no equilibrium" in moving.findings[0].sentence
     assert "is stable for small motions about this state, held at rest" in moving.verdict
@@ -143,7 +143,7 @@ def test_a_further_potential_that_its_rate_does_not_resolve_is_named():
     """Frequency 50, kicked every 0.08: Verlet's limit is 2."""
     system = vm.System(vm.ConstantMass([1.0], [1.0]), potentials={"bends": lambda q_s, q_f, params: 1250 * q_f @ q_f})
     scheme = vm.fully_explicit(16).with_potentials(bends=vm.micro(vm.quadrature.trapezoidal, every=8))
-    zero = jnp.zeros(1)
+    zero = np.zeros(1)
     advice = advise(system, scheme, vm.State(0.0, zero, zero, zero, zero + 0.1), macro_dt=0.16)
     assert "the bends potential alone: its frequency 50 times the step of 8 micro intervals is 4" in str(advice)
     assert "stable below 2" in str(advice)
@@ -160,8 +160,8 @@ def test_kicks_of_a_weight_that_meet_its_spring_in_phase(turn, warned):
     def spring(q_f, params):
         return params["k"] / 2 * q_f[0] ** 2
 
-    masses = vm.ConstantMass(jnp.zeros(0), jnp.ones(1))
-    system = vm.System(masses, weight, spring, params={"k": jnp.asarray((turn / macro_dt) ** 2)})
+    masses = vm.ConstantMass(np.zeros(0), np.ones(1))
+    system = vm.System(masses, weight, spring, params={"k": np.asarray((turn / macro_dt) ** 2)})
     problem, scheme = vm.Problem(system, [], [0.0]), vm.fully_explicit(200)
     findings = [f for f in vm.advise(problem, scheme, macro_dt=macro_dt).findings if f.kind == "kicks in phase"]
     assert bool(findings) == warned

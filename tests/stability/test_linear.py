@@ -26,7 +26,7 @@ def step_matrix(system, scheme, state, macro_dt, motions):
 
 def swinging_with_damping():
     problem = user_systems.double_pendulum()  # in angles, at rest below: a kinetic function with coupled masses
-    zero = jnp.zeros(1)
+    zero = np.zeros(1)
     system = problem.system.replace(force=lambda t, q_s, q_f, v_s, v_f, params: (-3.0 * v_s, -2e-5 * v_f + 0.01 * q_f))
     return system, vm.initial_state(system, zero, zero, zero, zero)
 
@@ -59,7 +59,7 @@ def test_constraint_forces_stiffen_a_pendulum():
         return 3 * 9.81 * q_f[1]
 
     system = vm.System(vm.ConstantMass([], [3.0, 3.0]), gravity, constraint=rod)
-    none = jnp.zeros(0)
+    none = np.zeros(0)
     for side in (-1.0, 1.0):
         motions = linearise(system, vm.initial_state(system, none, [0.0, 2.0 * side], none, [0.0, 0.0]))
         assert motions.stiffness == pytest.approx(-side * 9.81 / 2)
@@ -102,14 +102,14 @@ def test_multipliers_of_the_impulse_method():
 
 
 def test_no_second_derivative():
-    one = jnp.zeros(1)
+    one = np.zeros(1)
     system = vm.System(vm.ConstantMass([1.0], [1.0]), lambda q_s, q_f, params: jnp.linalg.norm(q_s))
     with pytest.raises(ValueError, match=r"expansion of .*slow.* is not finite"):
         linearise(system, vm.State(0.0, one, one, one, one))
 
 
 def test_nothing_moves():
-    one, none = jnp.ones(1), jnp.zeros(0)
+    one, none = np.ones(1), np.zeros(0)
     with pytest.raises(ValueError, match="the constraints leave none of the 1 coordinates free"):
         advise(
             vm.System(vm.ConstantMass([1.0], []), slow_constraint=lambda q_s, params: q_s - 1.0),

@@ -31,21 +31,21 @@ def stiff(q_f, params):
 def general():
     """Full mass matrices, all kinds of constraints, one of them moved; and a consistent start."""
     system = vm.System(
-        FULL_MASS, soft, stiff, constraint=vm.Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0)
+        FULL_MASS, soft, stiff, constraint=vm.Rheonomic(lifted), slow_constraint=sphere, params=np.asarray(3.0)
     )
     return system, vm.initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1], project=True)
 
 
 def free():
     """No constraints."""
-    system = vm.System(FULL_MASS, soft, stiff, params=jnp.asarray(3.0))
+    system = vm.System(FULL_MASS, soft, stiff, params=np.asarray(3.0))
     return system, vm.initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1], project=True)
 
 
 def slow_only():
     """A single potential of slow variables alone."""
     system = vm.System(
-        vm.ConstantMass(jnp.array([1.0, 2.0]), jnp.zeros(0)),
+        vm.ConstantMass(np.array([1.0, 2.0]), np.zeros(0)),
         lambda q_s, q_f, params: 50 * jnp.cosh(q_s[0] - q_s[1]) + q_s[0],
         slow_constraint=lambda q_s, params: jnp.sum(q_s**2, keepdims=True) - 1.0,
     )
@@ -54,7 +54,7 @@ def slow_only():
 
 def weight_only():
     """A potential without curvature, so that there is nothing but constraints to solve for."""
-    mass = vm.ConstantMass(jnp.array([1.0, 2.0]), jnp.zeros(0))
+    mass = vm.ConstantMass(np.array([1.0, 2.0]), np.zeros(0))
     system = vm.System(mass, lambda q_s, q_f, params: 9.81 * q_s[1], slow_constraint=sphere)
     return system, vm.initial_state(system, [0.6, 0.8], [], [0.4, -0.3], [])
 
@@ -97,9 +97,9 @@ def test_modes_are_eigenvectors(degree, rule):
 )
 def test_potentials_are_taken_at_the_nodes_of_their_rule_alone(scheme):
     """A potential that is undefined at the end of the step, where none of these rules has a node that is solved for."""
-    mass = vm.ConstantMass(jnp.zeros(0), jnp.ones(2))
+    mass = vm.ConstantMass(np.zeros(0), np.ones(2))
     system = vm.System(mass, fast_potential=lambda q_f, params: 1e-3 * jnp.sum(jnp.sqrt(q_f)))
-    none, one, h = jnp.zeros(0), jnp.ones(2), 0.1
+    none, one, h = np.zeros(0), np.ones(2), 0.1
     state = vm.State(jnp.zeros(()), none, one, none, -1.05 / h * one)
     planned = vm.plan(system, scheme, state, Solver("modes"))
     end, info, _ = jax.jit(lambda state: planned.step(state, planned.init(state, h), h))(state)
@@ -176,7 +176,7 @@ def test_derivatives_by_parameters():
         return jnp.concatenate([run.q_s[-1], run.q_f[-1]])
 
     eps = 1e-5
-    expected = (end(jnp.asarray(3 + eps)) - end(jnp.asarray(3 - eps))) / (2 * eps)
-    forward, reverse = jax.jacfwd(end)(jnp.asarray(3.0)), jax.jacrev(end)(jnp.asarray(3.0))
+    expected = (end(np.asarray(3 + eps)) - end(np.asarray(3 - eps))) / (2 * eps)
+    forward, reverse = jax.jacfwd(end)(np.asarray(3.0)), jax.jacrev(end)(np.asarray(3.0))
     assert largest_difference(forward, expected) < 1e-8
     assert largest_difference(forward, reverse) < 1e-12

@@ -58,7 +58,7 @@ def test_compositions_batches_and_gradients(fpu):
         vm.simulate(fpu, composed, solver=EXACT, macro_dt=0.08 / 2**k, num_steps=2 * 2**k)[-1].q_s for k in range(3)
     )
     assert np.log2(np.abs(coarse - fine).max() / np.abs(fine - finest).max()) > 3.5  # order 4
-    states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
+    states = jax.tree.map(lambda a: np.stack([a, a]), fpu.state())
     lanes = vm.simulate_batch(fpu, vm.fully_explicit(1), states, solver=EXACT, **STEPS)
     one = vm.simulate(fpu, vm.fully_explicit(1), solver=EXACT, **STEPS)
     np.testing.assert_allclose(lanes.states.q_f[1], one.states.q_f, rtol=1e-13)
@@ -70,7 +70,7 @@ def test_compositions_batches_and_gradients(fpu):
 
     omega = float(fpu.system.params["omega"])
     program = jax.jit(jax.value_and_grad(end))
-    difference = (program(omega + 1e-5)[0] - program(omega - 1e-5)[0]) / 2e-5
+    difference = (float(program(omega + 1e-5)[0]) - float(program(omega - 1e-5)[0])) / 2e-5
     np.testing.assert_allclose(program(omega)[1], difference, rtol=1e-5)
 
 

@@ -127,15 +127,15 @@ def hill(q_f, params):
 
 def test_contradicting_constraints_are_violated():
     system = vm.System(vm.ConstantMass([1.0], [1.0, 1.0]), constraint=on_two_circles)
-    one, zero = jnp.ones(1), jnp.zeros(1)
-    state = vm.State(jnp.zeros(()), zero, jnp.array([1.0, 0.0]), one, jnp.array([0.0, 0.5]))
+    one, zero = np.ones(1), np.zeros(1)
+    state = vm.State(np.zeros(()), zero, np.array([1.0, 0.0]), one, np.array([0.0, 0.5]))
     _, info = compiled_step(system, vm.fully_implicit(2), state, 0.1, EXACT)
     assert vm.Result(int(info.result)) is vm.Result.CONSTRAINT_VIOLATED
 
 
 def test_a_curvature_that_cancels_the_mass_is_singular():
     """``m - h^2 k / 4 = 0`` for the midpoint rule on a hill of curvature k."""
-    system = vm.System(vm.ConstantMass([1.0], [1.0]), fast_potential=hill, params=jnp.array(4.0))
+    system = vm.System(vm.ConstantMass([1.0], [1.0]), fast_potential=hill, params=np.array(4.0))
     state = vm.initial_state(system, [0.0], [0.3], [0.0], [0.1])
     _, info = compiled_step(system, vm.fully_implicit(1), state, 1.0, EXACT)
     assert vm.Result(int(info.result)) is vm.Result.SINGULAR

@@ -138,10 +138,10 @@ def test_fast_vibration_of_the_pivot_holds_a_pendulum_upright():
 
     def lowest(frequency):
         params = {"amplitude": 0.05, "frequency": frequency}
-        none = jnp.zeros(0)
+        none = np.zeros(0)
         system = vm.System(vm.ConstantMass(none, [1.0, 1.0]), weight, None, vm.Rheonomic(up_and_down), params=params)
-        q_f = jnp.array([LENGTH * np.sin(0.1), 0.05 + LENGTH * np.cos(0.1)])
-        state = vm.initial_state(system, none, q_f, none, jnp.zeros(2))
+        q_f = np.array([LENGTH * np.sin(0.1), 0.05 + LENGTH * np.cos(0.1)])
+        state = vm.initial_state(system, none, q_f, none, np.zeros(2))
         return vm.simulate(system, vm.fully_explicit(1), state, macro_dt=2e-3, num_steps=3000).q_f[:, 1].min()
 
     border = np.sqrt(2 * G * LENGTH) / 0.05
@@ -156,7 +156,7 @@ def test_derivatives_by_parameters():
         return vm.macro_step(system, vm.fully_explicit(2), state, 0.05, Solver("masses"))[0].q_f[0]
 
     # differences of the values of a program without derivatives: derivatives have equations of their own
-    value, at, h = jax.jit(end), jnp.asarray(0.3), 1e-5
+    value, at, h = jax.jit(end), np.asarray(0.3), 1e-5
     slope = (value(at + h) - value(at - h)) / (2 * h)
     assert float(jax.jit(jax.grad(end))(at)) == pytest.approx(float(slope), rel=1e-8)
 

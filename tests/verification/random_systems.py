@@ -292,16 +292,16 @@ def problem(of: Structure, at: Draw) -> vm.Problem:
     n_s = of.dimension * of.slow
     q, v, masses = (np.array(x) for x in (at.positions, at.velocities, at.masses))
     params = {
-        name: jnp.asarray(getattr(at, name), dtype=float)
+        name: np.asarray(getattr(at, name), dtype=float)
         for name in ("stiffness", "length", "small", "force", "masses", "time")
     }
     parts = functions(of)
-    points = jnp.asarray(q[:n_s]), jnp.asarray(q[n_s:])
+    points = np.asarray(q[:n_s]), np.asarray(q[n_s:])
     for name, value, off in zip(("constraint", "slow_constraint"), ("g", "g_slow"), at.off, strict=True):
         if name in parts:
             start = vm.System(vm.ConstantMass([], []), **{name: parts[name]}, params=params)
             rows = np.asarray(start.g(at.time, *points) if value == "g" else start.g_slow(at.time, points[0]))
-            params[value] = jnp.asarray(rows + off * np.arange(1, len(rows) + 1))
+            params[value] = np.asarray(rows + off * np.arange(1, len(rows) + 1))
     if of.kinetic in KINETIC:
         kinetic = parts["kinetic"]
     elif of.kinetic == "matrix":

@@ -233,8 +233,8 @@ def test_angular_momentum_and_constraints_of_the_pendulum_over_10000_steps(schem
 def hanging_pendulum():
     """The triple pendulum swinging regularly, not far from hanging."""
     system = PROBLEMS["tsp"]().system
-    q_s, q_f = jnp.array([3.0, 0.0, -9.5]), jnp.array([3.5, 0.5, -11.4, 3.6, 0.6, -14.4])
-    v_s, v_f = jnp.array([0.0, 1.0, 0.0]), jnp.array([0.5, 1.0, 0.0, 0.0, 1.5, 0.1])
+    q_s, q_f = np.array([3.0, 0.0, -9.5]), np.array([3.5, 0.5, -11.4, 3.6, 0.6, -14.4])
+    v_s, v_f = np.array([0.0, 1.0, 0.0]), np.array([0.5, 1.0, 0.0, 0.0, 1.5, 0.1])
     return system, vm.initial_state(system, q_s, q_f, v_s, v_f, project=True)
 
 

@@ -47,7 +47,7 @@ EXACT = {
 
 
 def problem_with(case):
-    one, zero = jnp.ones(1), jnp.zeros(1)
+    one, zero = np.ones(1), np.zeros(1)
     masses, params = ConstantMass([1.0], [1.0]), EXACT[case][0]
     system = System(masses, slow_potential=slow_spring, fast_potential=fast_spring, force=force, params=params)
     return Problem(system, one, one, zero, zero, t=0.5)

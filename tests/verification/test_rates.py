@@ -19,11 +19,11 @@ from vmri_jax import textbook
 from vmri_jax.schemes.quadrature import gauss, midpoint, simpson, trapezoidal
 
 NUM_MICRO, EVERY, H = 32, 8, 0.05
-MASS = jnp.array([2.0, 2.0, 1.0, 1.0, 1.5, 1.5, 1.0, 1.0])
-POINTS = jnp.array([0.0, 0.0, 1.0, 0.1, 1.9, -0.2, 2.9, 0.1])
-VELOCITY = jnp.array([0.1, 0.3, -0.2, -0.1, 0.05, -0.2, -0.1, 0.2])
+MASS = np.array([2.0, 2.0, 1.0, 1.0, 1.5, 1.5, 1.0, 1.0])
+POINTS = np.array([0.0, 0.0, 1.0, 0.1, 1.9, -0.2, 2.9, 0.1])
+VELOCITY = np.array([0.1, 0.3, -0.2, -0.1, 0.05, -0.2, -0.1, 0.2])
 LENGTHS = jnp.linalg.norm(jnp.diff(POINTS.reshape(4, 2), axis=0), axis=1)
-NONE = jnp.zeros(0)
+NONE = np.zeros(0)
 
 
 def pairs(q_s, q_f, params):
@@ -52,7 +52,7 @@ def rigid(q_s, q_f, params):
     return (jnp.sum(d * d, axis=1) - LENGTHS**2) / 2
 
 
-PARAMS = {"bends": jnp.asarray(40.0), "bonds": jnp.asarray(2000.0)}
+PARAMS = {"bends": np.asarray(40.0), "bonds": np.asarray(2000.0)}
 LEVELS = {"pairs": pairs, "bends": bends, "bonds": bonds}
 RULES = {"pairs": vm.macro(trapezoidal), "bends": vm.micro(trapezoidal, every=EVERY), "bonds": vm.micro(trapezoidal)}
 SCHEME = vm.fully_explicit(NUM_MICRO).with_potentials(**RULES)
@@ -228,8 +228,8 @@ def kinetic(q_s, q_f, v_s, v_f, params):
 
 MASSES = vm.ConstantMass([2.0, 2.0], [1.0, 1.0])
 TWO = vm.System(MASSES, soft, stiff)
-FREE = jnp.array([0.1, 0.2]), jnp.array([0.05, -0.02]), jnp.array([1.0, 0.0]), jnp.array([0.5, 1.0])
-HELD = jnp.array([0.0, 0.0]), jnp.array([0.6, -0.8]), jnp.array([1.0, 0.0]), jnp.array([1.8, 0.6])
+FREE = np.array([0.1, 0.2]), np.array([0.05, -0.02]), np.array([1.0, 0.0]), np.array([0.5, 1.0])
+HELD = np.array([0.0, 0.0]), np.array([0.6, -0.8]), np.array([1.0, 0.0]), np.array([1.8, 0.6])
 EXPLICIT, IMPLICIT, KICKS = vm.fully_explicit(6), vm.explicit_slow(6), vm.micro(trapezoidal)
 HALF, EVERY_SECOND, MACRO = vm.micro(midpoint), vm.micro(trapezoidal, every=2), vm.macro(trapezoidal)
 BOTH = vm.Scheme(6, kinetic=HALF, slow=EVERY_SECOND, fast=EVERY_SECOND)

@@ -153,7 +153,7 @@ def minimize(
         tell("compiling the steps and their derivatives", 0, max_iterations)
         for count in range(1, max_iterations + 1):
             try:
-                change, steepest, stages, final = update(setup, point)
+                change, steepest, point = update(setup, point)
             except bounded.Unsolved:  # the points of earlier iterations are still worth returning
                 if not history:
                     raise
@@ -161,7 +161,7 @@ def minimize(
             # The merit  cost + rho sum |misses|  is exact for rho above the largest multiplier; twice that leaves a
             # margin.
             nu, rho = change.nu, max(rho, 2 * steepest)
-            point, record = line_search(setup, point._replace(gaps=stages.c, goal=final.g), change, rho)
+            point, record = line_search(setup, point, change, rho)
             history.append(record)
             words = f"cost {record['cost']:.6g}, goal {record['miss']:.1e}, steps {record['gap']:.1e}"
             tell(words, count, max_iterations)
@@ -259,7 +259,7 @@ def _check_durations(scheme: SchemeLike, grid: str, parts: int) -> None:
     rule, starts = stage.force.composite(stage.num_micro), np.cumsum(lengths) - lengths
     times = (starts[:, None] + lengths[:, None] * np.asarray(rule.nodes)).ravel()
     weights = (lengths[:, None] * np.asarray(rule.weights)).ravel()
-    shares = weights @ jax.vmap(lambda t: held(t, jnp.eye(parts), 0.0, 1.0 / parts))(times) * parts
+    shares = weights @ np.stack([held(t, np.eye(parts), 0.0, 1.0 / parts) for t in times]) * parts
     # A run has the mean of two controls at a macro node: as the steps have if their rule weighs both ends alike.
     first, last = (weights[np.abs(times - end) <= NODE_TOLERANCE].sum() for end in (0, 1))
     is_inside = np.all((times >= -NODE_TOLERANCE) & (times <= 1 + NODE_TOLERANCE))
@@ -288,7 +288,7 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def started(setup: Transcription, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without gaps and miss; `start` as of `minimize`."""
+    """Nodes and controls of the first iteration, without gaps; `start` as of `minimize`."""
     nodes, shape = None, (num_steps, setup.parts, num_controls)
     if isinstance(start, Optimum):
         nodes, controls = _resampled(setup, start, num_steps)
@@ -300,18 +300,18 @@ def started(setup: Transcription, start, num_steps: int, num_controls: int, grid
         if controls.shape != expected:
             raise Refused(f"minimize: start has shape {controls.shape}; the controls have {expected}.")
         controls = controls.reshape(shape)
-    u = jnp.asarray(np.clip(controls, *setup.bounds))
+    u = np.clip(controls, *setup.bounds)
     if nodes is None:  # controls start from the motion that they make, without gaps
         nodes, _ = rolled(setup, u)
         if not np.isfinite(nodes).all():
             raise Refused("minimize: the motion with the first controls fails; give another start, or shorter steps.")
-    return Point(nodes, u, np.zeros(0), np.zeros(0))
+    return Point(nodes, u, np.zeros(0))
 
 
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
     """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to another grid of the same duration."""
     run, m = start.trajectory, start.controls.shape[-1]
-    old_nodes = np.asarray(phase_vector(run.states))
+    old_nodes = phase_vector(run.states)
     duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
     if abs(duration - expected) > 1e-9 * expected:
         raise Refused(
@@ -326,4 +326,4 @@ def _resampled(setup: Transcription, start: Optimum, num_steps: int):
     old_half, half = (duration / old_times.size) / 2, setup.macro_dt / setup.parts / 2
     columns = start.controls.reshape(-1, m).T
     controls = [np.interp(times.ravel() + half, old_times + old_half, column) for column in columns]
-    return jnp.asarray(nodes), np.stack(controls, axis=1).reshape(*times.shape, m)
+    return nodes, np.stack(controls, axis=1).reshape(*times.shape, m)

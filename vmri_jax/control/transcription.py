@@ -20,7 +20,7 @@ from jaxtyping import Float
 from vmri_jax.control import bounded, riccati
 from vmri_jax.control.bounded import Limits
 from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
-from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.arrays import Numbers, library
 from vmri_jax.mechanics.by_name import ByName
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.state import State
@@ -82,7 +82,7 @@ class Transcription(eqx.Module):
 
     def driven(self, u, t) -> System:
         """The system with the forces of controls u (..., parts, m) from time t on."""
-        held = jnp.reshape(u, (-1, u.shape[-1])), t, self.macro_dt / self.parts
+        held = library(u).reshape(u, (-1, u.shape[-1])), t, self.macro_dt / self.parts
         forces = _forces(self.system.force, self.actuate)
         return self.system.replace(force=forces, params={**self.system.params, CONTROL: held})
 
@@ -91,7 +91,7 @@ class Transcription(eqx.Module):
         return state_of(z, self.start.t + k * self.macro_dt, self.start)
 
     @property
-    def z_start(self) -> jax.Array:
+    def z_start(self):
         """The first state, (n,)."""
         return phase_vector(self.start)
 
@@ -208,8 +208,9 @@ def held(t, u, t_start, length):
     intervals weight each control by its duration. The controls u (k, m) follow each other, each of duration `length`,
     the first from t_start on.
     """
-    sides = (t - t_start) / length + jnp.array([-BORDER_WIDTH, BORDER_WIDTH])
-    return jnp.mean(u[jnp.clip(jnp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)
+    xp = library(t, u, t_start, length)
+    sides = (t - t_start) / length + np.array([-BORDER_WIDTH, BORDER_WIDTH])
+    return xp.mean(xp.asarray(u)[xp.clip(xp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)
 
 
 def convex(hessian):
@@ -223,22 +224,20 @@ class Point(NamedTuple):
 
     z, u: nodes after the first one, and controls.
     gaps: end of each step minus the next node.
-    goal: values of the goal, zero where it is reached.
     """
 
     z: Float[Numbers, "N n"]
     u: Float[Numbers, "N parts m"]
     gaps: Float[Numbers, "N n"]
-    goal: Float[Numbers, "e"]
 
 
 @eqx.filter_jit
 def measured(setup: Transcription, point: Point):
-    """Cost, sum of all violations, largest node and control, and largest value of a limit."""
-    over = setup.over(point.z, point.u)
-    violation = sum(jnp.sum(jnp.abs(x)) for x in (point.gaps, point.goal, jnp.maximum(over, 0.0)))
+    """Cost, sum of all violations, largest node and control, and largest values of the goal and of a limit."""
+    over, goal = setup.over(point.z, point.u), jnp.abs(setup.goal(setup.state(point.z[-1], len(point.z))))
+    violation = jnp.sum(jnp.abs(point.gaps)) + jnp.sum(goal) + jnp.sum(jnp.maximum(over, 0.0))
     sizes = (jnp.maximum(jnp.max(jnp.abs(a)), jnp.finfo(float).tiny) for a in (point.z, point.u))
-    return setup.total(point.z, point.u), violation, *sizes, jnp.max(over, initial=0.0)
+    return setup.total(point.z, point.u), violation, *sizes, jnp.max(goal, initial=0.0), jnp.max(over, initial=0.0)
 
 
 @eqx.filter_jit
@@ -247,9 +246,11 @@ def slope(setup: Transcription, point: Point, dz, du):
     return jax.jvp(setup.total, (point.z, point.u), (dz, du))[1]
 
 
-def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
-    """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the problem."""
+def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float, Point]:
+    """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the point with its
+    gaps."""
     stages, final = setup.linearised(point.z, point.u)
+    point = point._replace(gaps=np.asarray(stages.c))
     limits = setup.limited(point.z, point.u) if setup.bounded else None
     for name, part in (("cost, the steps or the goal", (stages, final)), ("limits", limits and limits[:3])):
         if not all(np.isfinite(a).all() for a in jax.tree.leaves(part)):
@@ -259,12 +260,12 @@ def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float,
             raise bounded.Unsolved(f"minimize: values or derivatives of {name} are not finite. {elsewhere}")
     if limits is not None:
         change, steepest = bounded.solve(stages, final, limits)
-        return change, steepest, stages, final
+        return change, steepest, point
     change = riccati.solve(stages, final)
     if not all(np.isfinite(a).all() for a in change):
         lacking = "the second derivative of cost in u is not positive: without it controls have no least cost"
         raise bounded.Unsolved(f"minimize: {lacking}. Add a small multiple of u @ u, or give bounds.")
-    return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
+    return change, float(np.abs(change.nu).max(initial=0.0)), point
 
 
 def line_search(setup: Transcription, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict]:
@@ -274,20 +275,19 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
     trials is accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated
     controls, without gaps, which suits bodies that turn far. The point stays, ``part`` 0, if no part is accepted.
     """
-    dz, du = change.dz, jnp.reshape(change.du, point.u.shape)
-    cost, violation, size_z, size_u, _ = measured(setup, point)
-    before = float(cost + rho * violation)
+    dz, du = np.asarray(change.dz), np.asarray(change.du).reshape(point.u.shape)
+    cost, violation, *_ = map(float, measured(setup, point))
+    before = cost + rho * violation
     # The whole update fulfils the linearised conditions: along it the violation decreases at the rate of its size.
-    expected = float(slope(setup, point, dz, du) - rho * violation)
+    expected = float(slope(setup, point, dz, du)) - rho * violation
     part, accepted = 1.0, None
     while accepted is None and part >= SHORTEST_PART:
         z, u = point.z + part * dz, point.u + part * du
         # the last term allows for round-off: near the optimum the merit changes by less
         allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (abs(cost) + rho * violation)
-        ends, _ = setup.steps(z, u, jnp.asarray(False))  # NaN where a step fails
-        trials = [_with_goal(setup, z, u, ends - z)]
+        ends, _ = setup.steps(z, u, np.asarray(False))  # NaN where a step fails
         motion, _ = rolled(setup, u)
-        trials.append(_with_goal(setup, motion, u, jnp.zeros_like(motion)))
+        trials = Point(z, u, np.asarray(ends) - z), Point(motion, u, np.zeros_like(motion))
         measures = [measured(setup, trial) for trial in trials]
         merits = [float(cost + rho * violation) for cost, violation, *_ in measures]
         best = int(np.nanargmin([*merits, np.inf]))  # a motion that fails has the merit NaN
@@ -297,22 +297,19 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
             part /= 2
     if accepted is None:
         part, accepted = 0.0, point
-    cost, _, size_z, size_u, over = measured(setup, accepted)
+    cost, _, size_z, size_u, miss, over = map(float, measured(setup, accepted))
     record = {
         "cost": cost,
-        "gap": np.abs(accepted.gaps).max() / size_z,
-        "miss": np.abs(accepted.goal).max(initial=0.0),
+        "gap": float(np.abs(accepted.gaps).max()) / size_z,
+        "miss": miss,
         "over": over,
-        "update": max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u),
+        "update": float(max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u)),
         "part": part,
     }
-    return accepted, {name: float(value) for name, value in record.items()}
+    return accepted, record
 
 
 def rolled(setup: Transcription, u):
     """Nodes of the motion with controls u, NaN from the first failed step on, and the `StepStatus` of the steps."""
-    return setup.steps(jnp.zeros((len(u), setup.z_start.size)), u, jnp.asarray(True))
-
-
-def _with_goal(setup: Transcription, z, u, gaps) -> Point:
-    return Point(z, u, gaps, setup.goal(setup.state(z[-1], len(z))))
+    nodes, status = setup.steps(np.zeros((len(u), setup.z_start.size)), u, np.asarray(True))
+    return np.asarray(nodes), status

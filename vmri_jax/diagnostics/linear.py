@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
@@ -28,7 +29,7 @@ With fewer their lengths are not one to round-off, with more nothing changes.
 
 def phase_vector(state: State):
     """``z = (q_s, q_f, p_s, p_f)``, joined, (2 n,), or (k, 2 n) for k states."""
-    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f], axis=-1)
+    return library(state).concatenate([state.q_s, state.q_f, state.p_s, state.p_f], axis=-1)
 
 
 def state_of(z, t, like: State) -> State:

@@ -203,7 +203,7 @@ class _Search:
         return misses, weight * np.sqrt(self.count) * gaps / self.scale
 
     def solve(self, u, z, values):
-        """The search from u, z: its end (u, z), misses, iterations, whether it converged, largest gap."""
+        """The search from u, z: its end (u, z), misses, gaps in units of `scale`, iterations, whether it converged."""
         optimistix = extra("optimistix", "fit", "fit")
         solver = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
         weights = jnp.asarray(GAP_WEIGHTS if self.shooting.segments > 1 else (1.0,))
@@ -216,7 +216,7 @@ class _Search:
 
         (u, z), (iterations, good) = jax.lax.scan(stage, (u, z), weights)
         misses, gaps = self.residual((u, z), (values, 1 / np.sqrt(self.count)))
-        return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
+        return u, z, misses, gaps, jnp.sum(iterations), good[-1]
 
     def jacobian(self, u, z, values):
         """Jacobians of misses and gaps with their last weight, by the parameters and by the starts of the parts."""
@@ -249,24 +249,25 @@ class _Search:
         solve = self.compiled(jax.vmap(_Search.solve, (None, 0, 0, None)))
         ends = [np.asarray(a) for a in solve(u, z, self.shooting.values)]
         squares = np.sum(ends[2] ** 2, axis=1)  # of the misses
-        u, z, misses, iterations, good, gap = (a[np.argmin(squares)] for a in ends)
+        u, z, misses, gaps, iterations, good = (a[np.argmin(squares)] for a in ends)
         tell("the derivatives at the end of the search", 3, NUM_PHASES)
         jacobians = [np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values)]
-        end = {"iterations": int(iterations), "success": bool(good), "gap": float(gap), "squares": squares}
-        change = self.change_by_half_steps(u, z, jacobians)
+        gap = float(np.abs(gaps).max(initial=0.0))
+        end = {"iterations": int(iterations), "success": bool(good), "gap": gap, "squares": squares}
+        residual = misses, GAP_WEIGHTS[-1] * np.sqrt(self.count) * gaps
+        change = self.change_by_half_steps(u, z, residual, jacobians)
         return Fit.of(self.shooting, u, misses, jacobians, change, **end, again=partial(self.again, u, z))
 
-    def change_by_half_steps(self, u, z, jacobians) -> np.ndarray:
+    def change_by_half_steps(self, u, z, residual, jacobians) -> np.ndarray:
         """Change (p,) of the parameters with steps of half the length, to first order ``-J^+ (r(H/2) - r(H))``.
 
         A fit hides the error of its scheme in the parameters: too large a step lowers a frequency, and a larger
         stiffness makes up for it. Neither the misses nor the covariance show this error.
         """
-        point = (u, z), (self.shooting.values, GAP_WEIGHTS[-1])
         runs, halved = self.shooting, copy(self)
         halved.shooting = replace(runs, macro_dt=runs.macro_dt / 2, steps=[2 * steps for steps in runs.steps])
-        coarse, fine = (search.compiled(_Search.residual)(*point) for search in (self, halved))
-        difference = np.concatenate([np.ravel(b - a) for a, b in zip(coarse, fine, strict=True)])
+        fine = halved.compiled(_Search.residual)((u, z), (self.shooting.values, GAP_WEIGHTS[-1]))
+        difference = np.concatenate([np.ravel(np.asarray(b) - a) for a, b in zip(residual, fine, strict=True)])
         jacobian = np.asarray(without_starts(*jacobians))
         size = np.linalg.norm(jacobian, axis=0)
         size = np.where(size > 0, size, 1.0)

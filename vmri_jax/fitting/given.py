@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
+from scipy.special import expit
 
-from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.arrays import library, real_array
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.state import State
@@ -158,15 +158,16 @@ class Unknown:
 
     def at(self, u):
         """The parameter for a search variable of the same shape; 0 is the start."""
+        xp = library(u, *self.numbers)
         if self.lower is None and self.upper is None:
-            size = jnp.where(self.start == 0, 1.0, jnp.abs(self.start))
+            size = xp.where(self.start == 0, 1.0, abs(self.start))
             return self.start + (size if self.scale is None else self.scale) * u
         if self.upper is None:
-            return self.lower + (self.start - self.lower) * jnp.exp(u)
+            return self.lower + (self.start - self.lower) * xp.exp(u)
         if self.lower is None:
-            return self.upper - (self.upper - self.start) * jnp.exp(u)
-        part = (self.start - self.lower) / (self.upper - self.lower)
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(jnp.log(part / (1 - part)) + u)
+            return self.upper - (self.upper - self.start) * xp.exp(u)
+        part, sigmoid = (self.start - self.lower) / (self.upper - self.lower), expit if xp is np else jax.nn.sigmoid
+        return self.lower + (self.upper - self.lower) * sigmoid(xp.log(part / (1 - part)) + u)
 
 
 class Unknowns:
@@ -174,17 +175,18 @@ class Unknowns:
 
     def __init__(self, unknowns: Mapping[str, Unknown]):
         self.unknowns = dict(unknowns)
-        numbers, self._parts = ravel_pytree([unknown.start for unknown in self.unknowns.values()])
-        self.size = numbers.size
+        self._ends = np.cumsum([unknown.start.size for unknown in self.unknowns.values()])
+        self.size = int(self._ends[-1])
 
     def at(self, u) -> dict:
         """The parameters by name."""
-        parts = zip(self.unknowns.items(), self._parts(jnp.asarray(u)), strict=True)
-        return {name: unknown.at(part) for (name, unknown), part in parts}
+        parts = zip(self.unknowns.items(), library(u).split(u, self._ends[:-1]), strict=True)
+        return {name: unknown.at(part.reshape(unknown.start.shape)) for (name, unknown), part in parts}
 
-    def vector(self, parameters: Mapping) -> jax.Array:
+    def vector(self, parameters: Mapping):
         """All numbers in a row."""
-        return ravel_pytree([parameters[name] for name in self.unknowns])[0]
+        xp = library(parameters)
+        return xp.concatenate([xp.ravel(parameters[name]) for name in self.unknowns])
 
     @property
     def labels(self) -> list[str]:

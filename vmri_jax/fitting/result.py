@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
@@ -12,7 +11,7 @@ from scipy import stats
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.shooting import Shooting
-from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.arrays import library, whole_number
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.refusals import Refused, warn_user
@@ -232,7 +231,7 @@ def without_starts(by_parameters, by_starts):
     the complement of the range of the Jacobian (m, k) with respect to the starts."""
     if not by_starts.size:
         return by_parameters
-    q, sizes, _ = jnp.linalg.svd(by_starts, full_matrices=False)
+    q, sizes, _ = library(by_starts).linalg.svd(by_starts, full_matrices=False)
     q = q * (sizes > STARTS_RANK_TOLERANCE * sizes[0])
     return by_parameters - q @ (q.T @ by_parameters)
 

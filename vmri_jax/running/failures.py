@@ -3,6 +3,7 @@ swapped rates."""
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from vmri_jax.mechanics.invariants import velocity
@@ -71,7 +72,7 @@ def largest_motion(system: System, state: State, names: Names | None, macro_dt: 
     A rigid body turns by ``h |omega|`` with ``2 |omega|^2 = sum_i |dd_i/dt|^2`` over its three directors d_i.
     """
     q, h = {"s": np.asarray(state.q_s), "f": np.asarray(state.q_f)}, {"s": macro_dt, "f": macro_dt / num_micro}
-    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    v_s, v_f = jax.jit(velocity)(system, state.q_s, state.q_f, state.p_s, state.p_f)
     moves = {"s": h["s"] * np.asarray(v_s), "f": h["f"] * np.asarray(v_f)}
     known = (names or Names()).of_coordinates(q["s"].size, q["f"].size)
     labels = {"s": known.slow_coordinates, "f": known.fast_coordinates}

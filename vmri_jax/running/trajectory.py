@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vmri_jax.mechanics.arrays import Numbers, is_concrete, is_known
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, is_known, numbers_of
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.state import HasProblem, Problem, State
@@ -211,7 +211,7 @@ class Trajectory(Exports):
     def __getitem__(self, nodes):
         chosen, lanes = chosen_nodes(self, nodes), (slice(None),) * (np.ndim(self.t) - 1)
         if isinstance(chosen, int):
-            return jax.tree.map(lambda a: a[*lanes, chosen], self.states)
+            return jax.tree.map(lambda a: a[*lanes, chosen], numbers_of(self.states))
         if not is_concrete(self.energy):
             raise Refused("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
         arrays = named_arrays(self)
@@ -234,7 +234,7 @@ class Trajectory(Exports):
         """
         if np.ndim(self.t) != 2:
             raise Refused("lane: this is one run, no batch of runs.")
-        run = jax.tree.map(lambda a: a[i], self)
+        run = jax.tree.map(lambda a: a[i], numbers_of(self))
         return replace(run, result=status(run.result))
 
     @property

@@ -7,12 +7,9 @@ counted from one saved node to the next.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import chain
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
@@ -68,11 +65,10 @@ def with_rates(
         pairs, about = range(len(joint.elements)), f"Scene.with_rates: the rate of {joint.name}"
         numbers = for_pairs(about, number, len(pairs), "one number")
 
-        def freedoms(q, joint=joint, freedom=freedom, pairs=pairs):
-            coordinates = {name: q[columns[name]] for name in moving(chain(*joint.elements))}
-            return jnp.stack([joint.value(freedom, i, coordinates) for i in pairs])
-
-        rows.append(np.asarray(jax.jacfwd(freedoms)(jnp.asarray(bodies))) @ of_bodies)
+        # dx/dQ of the coordinates Q of bodies: the rates of x along unit vectors
+        along = {name: np.eye(bodies.size)[:, columns[name]] for name in moving(chain(*joint.elements))}
+        there = {name: np.broadcast_to(bodies[columns[name]], unit.shape) for name, unit in along.items()}
+        rows.append(np.stack([joint.value_and_rate(freedom, i, there, along)[1] for i in pairs]) @ of_bodies)
         values.append(np.broadcast_to(numbers, (len(pairs),)))
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(mass_and_momentum(system, *start)[0])  # M = R R^T
@@ -212,11 +208,10 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
     pair = range(len(elements))[pair]  # raises IndexError
     if (label := joint.label(pair, freedom)) in run.names.bodies:
         return np.asarray(run.position(label))[..., 0]
-    value = partial(joint.value, freedom, pair)
     q = {name: run.position(name) for name in moving(elements[pair])}
     if freedom not in ANGLES:
-        return np.asarray(value(q))
-    angle, rate = map(np.asarray, jax.jvp(value, (q,), ({name: run.velocity(name) for name in q},)))
+        return np.asarray(joint.value(freedom, pair, q))
+    angle, rate = joint.value_and_rate(freedom, pair, q, {name: run.velocity(name) for name in q})
     counted, dt, rates = np.unwrap(angle), np.diff(run.t), (rate[..., 1:], rate[..., :-1])
     fastest, excess = np.maximum(*np.abs(rates)), np.abs(np.diff(counted) - dt * np.mean(rates, axis=0))
     # an angle that moves by a quarter of a turn more or less than both rates say is faster in between

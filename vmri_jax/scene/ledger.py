@@ -168,7 +168,7 @@ def _ledger(bodies, functions, system: System, start, scheme, macro_dt: float | 
     for name, size, pace, reason in bodies:
         grid = "micro" if pace == "fast" else "macro"
         rows.append(LedgerRow(name, "body", grid, f"{pace}: {reason}", nodes[grid] * size, 0, 0))
-    q = jnp.concatenate(start[:2])
+    q = np.concatenate(start[:2])
     for name, key, kind, reason, alone, is_evaluated in functions:
         rule = stage.rule_of(key)
         reason = reason or f"the rule of the scheme for it: {rule.in_words()}"

@@ -14,11 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, real_array
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.description import Description, printed
 from vmri_jax.schemes.scheme import Scheme
@@ -129,7 +128,7 @@ class Composition(eqx.Module):
     def micro_times(self):
         """(num_micro,) ends of the micro steps in units of the macro step; they decrease in stages that go
         backwards."""
-        ends = jnp.cumsum(self.coefficients)
+        ends = library(self.coefficients).cumsum(self.coefficients)
         return (ends[:, None] - self.coefficients[:, None] * (1 - self.scheme.micro_times)).reshape(-1)
 
     @property

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vmri_jax.kernels import matmul
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.path import Nodes, lagrange_basis, lagrange_derivative
@@ -44,7 +45,7 @@ class IntervalNodes:
         if (of == of[0]).all():
             self.weights = nodes.distinct[of[:1]]  # of all intervals
         else:
-            self.weights = jnp.append(nodes.distinct, 0.0)[of]
+            self.weights = library(nodes.distinct).append(nodes.distinct, 0.0)[of]
         self.c, self.theta = c, (np.arange(n)[:, None] + c) / n
         self.tables = {
             "q_s": lagrange_basis(r, self.theta)[..., 1:],

@@ -10,11 +10,10 @@ two nearly equal positions: momenta keep full relative precision however small t
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.arrays import Numbers, library
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, lobatto, macro
 
@@ -111,7 +110,7 @@ def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any
     end = rule.weights[-1] / size if has_end else None
     inside = range(has_start, len(rule.nodes) - has_end)
     meets = range(every, num_micro, every) if size > 1 and (has_start or has_end) else range(0)
-    meeting = sum((w for w in (start, end) if w is not None), jnp.zeros(()))
+    meeting = sum(w for w in (start, end) if w is not None)
     return start, _nodes(placed, num_micro, degree, inside, meets, meeting), end
 
 
@@ -125,8 +124,8 @@ def _nodes(
     interval = np.concatenate([np.array(meets, int), *(starts + m for m, _ in at)])
     c = np.concatenate([np.zeros(len(meets)), *(np.full(len(starts), c) for _, c in at)])
     of = np.repeat(np.arange(1 + len(at)), [len(meets)] + [len(starts)] * len(at))
-    weights = jnp.stack([meeting, *(placed.rule.weights[i] / copies for i in numbers)])
-    return Nodes(interval, c, of, weights, num_micro, degree)
+    weights = [meeting, *(placed.rule.weights[i] / copies for i in numbers)]
+    return Nodes(interval, c, of, library(*weights).stack(weights), num_micro, degree)
 
 
 def _interval_of(node: float, count: int) -> tuple[int, float]:
