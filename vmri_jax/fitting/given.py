@@ -158,7 +158,7 @@ class Unknown:
 
     def at(self, u):
         """The parameter for a search variable of the same shape; 0 is the start."""
-        xp = library(u, *self.numbers)
+        xp = library(u, vars(self))
         if self.lower is None and self.upper is None:
             size = xp.where(self.start == 0, 1.0, abs(self.start))
             return self.start + (size if self.scale is None else self.scale) * u

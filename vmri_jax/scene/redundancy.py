@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
-from vmri_jax.mechanics.constraints import RANK, ROUNDING, START, rank_of
+from vmri_jax.mechanics.constraints import RANK, START, rank_of
+from vmri_jax.mechanics.slopes import ROUNDING
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import Key
 from vmri_jax.scene.body import Bodies, listed

@@ -207,7 +207,7 @@ class TangentDamping:
 
     def forces(self, values, params):
         """Force on (q_s, q_f), as of `EffectTerm`."""
-        products = totals([term.forces(values, params) for term in self.terms])
+        products = total([term.forces(values, params) for term in self.terms])
         return tuple(-params[self.name]["stiffness"] * product for product in products)
 
     @property
