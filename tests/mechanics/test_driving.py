@@ -71,6 +71,21 @@ def test_events_of_each_kind(center, width, t_0, t_end):
     assert drives.shortest == lengths[0]
 
 
+def along_an_arm(t, q_s, q_f, v_s, v_f, params):
+    """The moment of a force along an arm, whose terms cancel, alone and beside a moment of 1e-9 of the terms."""
+    size, arm = 3e3 * (1 + 0.3 * jnp.sin(2 * t)), jnp.stack([jnp.cos(q_s[0]), jnp.sin(q_s[0])])
+    moment = arm[0] * (size * arm[1]) - arm[1] * (size * arm[0])
+    return jnp.stack([moment, moment + 3e-6 * jnp.sin(2 * t), jnp.sin(2 * t), 0.0]), q_f
+
+
+def test_round_off_is_no_event_and_no_jump():
+    """Two half waves and no events of the 1e5 turns of the round-off of the first two entries."""
+    drives = events(vm.System(vm.ConstantMass(np.ones(4), [1.0]), force=along_an_arm), state_at(0.0), 5.0)
+    assert not drives.jump
+    assert drives.shortest == pytest.approx(np.pi / 2, rel=1e-3)
+    assert len(drives.times) == 2 * 3  # of the turns of the sine waves in the second and the third entry
+
+
 def test_a_jump_is_no_event():
     system = vm.System(vm.ConstantMass(np.ones(4), [1.0]), force=kicked)
     assert events(system.replace(force=None), state_at(0.0), 1.0).names == ()

@@ -4,6 +4,9 @@ An *event* is a peak or a dip in time of an entry of the force F, of a moving co
 long as the entry keeps more than half of the smaller of its swings before and after the turning point: a rectangular
 pulse its length, half a sine wave half a period. A jump or a ramp to another value is no event: no step passes over it,
 since all later nodes see the new value.
+
+The round-off of an entry may be all that it has, as of the generalised force on a joint about which two opposite forces
+have no moment. It is neither an event nor a jump: an entry counts as constant within its round-off, which is measured.
 """
 
 from functools import lru_cache, partial
@@ -27,7 +30,13 @@ MOST_NUMBERS = 2**23
 CHUNK = 2**22
 """Most numbers that the compiled program returns in one call, 32 MiB; a larger value takes more memory."""
 LEAST_HEIGHT = 1e-6
-"""Least height of an event, as a part of the range of its entry; a smaller value takes round-off for events."""
+"""Least height of an event, as a part of the range of its entry; a smaller value reports ripples that no run feels."""
+TINY = 2.0**-40
+"""Steps in which round-off is measured, relative to the length of the time, to positions and to velocities. In smaller
+steps terms keep their round-off, in larger ones the smooth change of an entry counts as round-off."""
+SAFETY = 4.0
+"""Round-off that counts over the round-off that was measured at fewer times; a smaller value reports round-off as
+events, a larger one overlooks weak drives beside large forces that cancel."""
 REFINEMENTS, PARTS = 3, 16
 """Rounds of refinement about events that last less than `COARSE` samples, and the parts of a refined interval: 16^3
 times finer samples."""
@@ -92,22 +101,27 @@ def events(system: System, state, t_end: float) -> Events:
     names, t_0 = driven(system, state), float(state.t)
     if not names or not t_end > t_0:
         return Events(names)
-    program = partial(_sampled, system, names, generic(state, t_end - t_0))
+    configuration = generic(state, t_end - t_0)
+    program = partial(_sampled, system, names, configuration)
     size = jax.eval_shape(program, jnp.zeros(1)).shape[1]
     chunk = 2 ** int(np.log2(np.clip(CHUNK // size, PARTS, SAMPLES // PARTS)))
 
     def chunks(t: np.ndarray):
         padded = np.append(t, np.full(-len(t) % chunk, t[-1])).reshape(-1, chunk)
-        return (np.nan_to_num(np.asarray(program(part)), posinf=0.0, neginf=0.0) for part in padded)
+        return (np.asarray(program(part)) for part in padded)
 
     def values(t: np.ndarray) -> np.ndarray:
         return np.concatenate([part[:, varying] for part in chunks(t)])[: len(t)]
 
-    coarse = next(chunks(t_0 + (t_end - t_0) * _unit_times(chunk)))
-    num = int(np.clip(MOST_NUMBERS // max(1, np.count_nonzero(np.ptp(coarse, axis=0))), chunk, SAMPLES))
+    t = t_0 + (t_end - t_0) * _unit_times(chunk)
+    coarse, noise = next(chunks(t)), round_off(system, names, configuration, t)
+    num = int(np.clip(MOST_NUMBERS // max(1, np.count_nonzero(np.ptp(coarse, axis=0) > noise)), chunk, SAMPLES))
     t = t_0 + (t_end - t_0) * _unit_times(num)
     # Of the entries of many bodies, few vary: the others are not kept.
-    parts = [(columns := np.flatnonzero((part != coarse[0]).any(axis=0)), part[:, columns]) for part in chunks(t)]
+    parts = [
+        (columns := np.flatnonzero((np.abs(part - coarse[0]) > noise).any(axis=0)), part[:, columns])
+        for part in chunks(t)
+    ]
     varying = np.unique(np.concatenate([columns for columns, _ in parts]))
     f = np.concatenate([np.broadcast_to(coarse[0, varying], (chunk, len(varying)))] * len(parts))
     for i, (columns, part) in enumerate(parts):
@@ -115,30 +129,36 @@ def events(system: System, state, t_end: float) -> Events:
     f, distance = f[: len(t)], (t_end - t_0) / len(t)
     if not len(varying):
         return Events(names)
-    jump = _jumps(values, t, f)
+    least = noise[varying] / LEAST_HEIGHT
+    jump = _jumps(values, t, f, _ranges(f, least))
     for _ in range(REFINEMENTS):
-        drives = _events(names, t, f, jump)
+        drives = _events(names, t, f, jump, least)
         if drives.shortest > COARSE * distance:
             return drives
         # Insert times where neighbouring samples differ most.
         distance /= PARTS
-        parted = _steepest(f, chunk // PARTS)
+        parted = _steepest(f, chunk // PARTS, _ranges(f, least))
         new = (t[parted, None] + np.diff(t)[parted, None] * np.arange(1, PARTS) / PARTS).reshape(-1)
         order = np.argsort(np.append(t, new), kind="stable")
         t, f = np.append(t, new)[order], np.concatenate([f, values(new)])[order]
-    return _events(names, t, f, jump)
+    return _events(names, t, f, jump, least)
 
 
-def _steepest(f: np.ndarray, num: int) -> np.ndarray:
+def _ranges(f: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """(m,) the range of each entry of f (k, m), at least `least`, of which round-off is the part `LEAST_HEIGHT`."""
+    return np.maximum(np.ptp(f, axis=0), least)
+
+
+def _steepest(f: np.ndarray, num: int, span: np.ndarray) -> np.ndarray:
     """(num,) the intervals in which an entry of f (k, m) changes most, relative to its range."""
-    change = (np.abs(np.diff(f, axis=0)) / np.maximum(np.ptp(f, axis=0), np.finfo(float).tiny)).max(axis=1)
+    change = (np.abs(np.diff(f, axis=0)) / span).max(axis=1)
     return np.argpartition(change, -num)[-num:]
 
 
-def _jumps(values, t: np.ndarray, f: np.ndarray) -> bool:
+def _jumps(values, t: np.ndarray, f: np.ndarray, span: np.ndarray) -> bool:
     """Whether an entry changes by more than `LEAST_JUMP` of its range in the 16^3-th part of one of the steepest
     intervals."""
-    steepest, span = _steepest(f, PARTS), np.maximum(np.ptp(f, axis=0), np.finfo(float).tiny)
+    steepest = _steepest(f, PARTS, span)
     begin, end, change = t[steepest], t[steepest + 1], np.abs(np.diff(f, axis=0)[steepest] / span).max(initial=0.0)
     for _ in range(REFINEMENTS):
         if change < LEAST_JUMP:
@@ -166,9 +186,26 @@ def _sampled(system: System, names: tuple[str, ...], configuration, times):
             if term.field in names:
                 value = partial(_at_time, term, system.params, values)
                 parts += value(t) if term.kind == "force" else jax.jvp(value, (t,), (jnp.ones_like(t),))
-        return jnp.concatenate(parts)
+        return jnp.nan_to_num(jnp.concatenate(parts), posinf=0.0, neginf=0.0)
 
     return jax.vmap(entries)(times)
+
+
+def round_off(system: System, names: tuple[str, ...], configuration, times: np.ndarray) -> np.ndarray:
+    """(m,) the round-off of the entries of the terms `names`, `SAFETY` times their largest second difference
+
+        f(x) - 2 f(x + h) + f(x + 2 h),    x = (t, q_s, q_f, v_s, v_f)
+
+    at the times (k,). Smooth changes add the square of h, `TINY`, only, and round-off up to four times itself: Moré and
+    Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011). The first and the last time are left out, at
+    which drives are switched on and off.
+    """
+    x, h = (times[1:-1], *configuration), (np.ptp(times), *configuration)
+    lines = []
+    for k in range(3):
+        t, *moved = (a + k * TINY * step for a, step in zip(x, h, strict=True))
+        lines.append(np.asarray(_sampled(system, names, tuple(moved), np.pad(t, 1, mode="edge"))))
+    return SAFETY * np.abs(np.diff(lines, n=2, axis=0)[0]).max(axis=0)
 
 
 @partial(jax.jit, static_argnames="names")
@@ -197,20 +234,21 @@ def _unit_times(num: int) -> np.ndarray:
     return times
 
 
-def _events(names: tuple[str, ...], t: np.ndarray, f: np.ndarray, jump: bool) -> Events:
-    """The events of all entries f (k, m) at times t (k,)."""
-    pairs = [(np.zeros(0), np.zeros(0)), *(_events_of(t, entry) for entry in f.T if np.ptp(entry) > 0)]
+def _events(names: tuple[str, ...], t: np.ndarray, f: np.ndarray, jump: bool, least: np.ndarray) -> Events:
+    """The events of all entries f (k, m) at times t (k,), with their least ranges."""
+    heights = LEAST_HEIGHT * _ranges(f, least)
+    pairs = [(np.zeros(0), np.zeros(0)), *map(partial(_events_of, t), f.T, heights)]
     times, lengths = map(np.concatenate, zip(*pairs, strict=True))
     order = np.argsort(times)
     return Events(names, times[order], lengths[order], jump)
 
 
-def _events_of(t: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times and lengths of the events of one entry f (k,)."""
+def _events_of(t: np.ndarray, f: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and lengths of the events of one entry f (k,) that are not lower than a height."""
     steps = np.diff(f)
     moving = np.flatnonzero(steps)
     turns = moving[1:][np.diff(np.sign(steps[moving])) != 0]
-    turns = _without_ripples(f, np.concatenate([[0], turns, [len(f) - 1]]))
+    turns = _without_ripples(f, np.concatenate([[0], turns, [len(f) - 1]]), height)
     heights, inner = np.abs(np.diff(f[turns])), turns[1:-1]
     if not inner.size:
         return np.zeros(0), np.zeros(0)
@@ -225,14 +263,14 @@ def _events_of(t: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t[inner], np.where(is_cut, after, before) + np.where(is_cut_after, before, after)
 
 
-def _without_ripples(f: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """The turning points without pairs whose values differ by less than `LEAST_HEIGHT`, the smallest first."""
+def _without_ripples(f: np.ndarray, turns: np.ndarray, height: float) -> np.ndarray:
+    """The turning points without pairs whose values differ by less than a height, the smallest first."""
     random = np.random.default_rng(0)
     while len(turns) > 2:
         # Equal heights, as of round-off, are told apart at random: else a pass would remove few of them.
         heights = np.abs(np.diff(f[turns])) * (1 + LEAST_HEIGHT * random.random(len(turns) - 1))
         sides = np.pad(heights, 1, constant_values=np.inf)
-        ripples = np.flatnonzero((heights < LEAST_HEIGHT * np.ptp(f)) & (heights <= sides[:-2]) & (heights < sides[2:]))
+        ripples = np.flatnonzero((heights < height) & (heights <= sides[:-2]) & (heights < sides[2:]))
         removed = np.union1d(ripples, ripples + 1)
         removed = removed[(removed > 0) & (removed < len(turns) - 1)]
         if not removed.size:
