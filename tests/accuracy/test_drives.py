@@ -109,6 +109,8 @@ def test_steps_over_a_pulse_are_not_certified():
     with pytest.warns(UncertifiedWarning, match=r"from t = 3\.298 on no error is certified: force of the system.*take"):
         run = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.1, t_end=LENGTH, error=True)
     assert 2.0 <= float(run.error.certified_until) <= 3.2  # the third companion has a node in common every 2.0
+    with pytest.warns(UncertifiedWarning, match="from t = 0 on no error is certified"):
+        vm.simulate(oscillator(GAUSS, 5e-4, 1e-3, 400.0), vm.fully_explicit(1), macro_dt=0.1, t_end=LENGTH, error=True)
     smaller = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.0005, t_end=LENGTH, save=200, error=True)
     true = np.abs(smaller.q_s[:, 0] - motion(np.asarray(smaller.t), problem.system.params)).max()
     assert smaller.error.largest == pytest.approx(true, rel=0.1)  # 0.2 % measured
@@ -118,6 +120,16 @@ def test_events_demand_many_steps(monkeypatch):
     monkeypatch.setattr("vmri_jax.accuracy.search.MANY_STEPS", 100)
     with pytest.warns(UserWarning, match="force of the system changes and changes back within 0.03"):
         vm.simulate(oscillator(RECTANGLE, 7.123, 0.03, 20.0), vm.fully_explicit(1), accuracy=1e-1, t_end=LENGTH)
+
+
+def test_events_that_no_run_sees_are_refused(monkeypatch):
+    """The menu goes on with steps that have more nodes, 667 of them, and without any is refused before a run."""
+    problem = oscillator(RECTANGLE, 7.123, 0.03, 20.0)
+    monkeypatch.setattr("vmri_jax.accuracy.companions.MOST_STEPS", 1000)
+    run = vm.simulate(problem, accuracy=1e-1, t_end=LENGTH)
+    assert run.settings.python.startswith("vm.galerkin(1, 2")
+    with pytest.raises(vm.Refused, match=r"near t = 7.15. force of the system.* 1.3e\+03 macro steps"):
+        vm.simulate(problem, vm.fully_explicit(1), accuracy=1e-1, t_end=LENGTH)
 
 
 def springs(q_s, q_f, params):

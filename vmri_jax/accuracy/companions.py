@@ -65,6 +65,10 @@ with fewer nodes."""
 NODES_OF_EVENT = 4
 """Least nodes of forces, or of moving constraints, in an event. With fewer nodes the errors of a run and its companions
 say nothing about each other; with more of them driven systems take more steps than their accuracy needs."""
+MOST_STEPS = 2**22
+"""Macro steps of the longest run that a search takes, an hour with a millisecond for each step. With a larger value
+searches for an accuracy out of reach, and for events too short for any run, take hours; with a smaller one short pulses
+are refused that a run could see."""
 FURTHER_PARTS = (1.6, 2.6)
 """Steps of further companions over the steps of the run, near multiples of the golden ratio: hardly any of their nodes
 is near a node of the run. Forces that jump take both, other driven systems the first one. More companions take
@@ -207,19 +211,28 @@ def node_distance(scheme: SchemeLike, drives: Events) -> float:
 
 
 def fewest_steps(scheme: SchemeLike, drives: Events, length: float) -> int:
-    """Fewest macro steps in a time with `NODES_OF_EVENT` nodes in the shortest event."""
-    if not drives.names:
+    """Fewest macro steps with `NODES_OF_EVENT` nodes in the shortest event; refuses more than `MOST_STEPS`."""
+    if not drives.lengths.size:
         return 1
-    return int(np.ceil(NODES_OF_EVENT * node_distance(scheme, drives) * length / drives.shortest))
+    fewest = int(np.ceil(NODES_OF_EVENT * node_distance(scheme, drives) * length / drives.shortest))
+    if fewest > MOST_STEPS:
+        raise Refused(
+            f"t_end is {length:.4g} after the start, and near t = {drives.times[drives.lengths.argmin()]:.4g} "
+            f"{' and '.join(drives.names)} of the system changes and changes back within {drives.shortest:.2g}: a run "
+            f"that sees this takes {fewest:.1e} macro steps, and no run of more than {MOST_STEPS} is chosen. Give a "
+            "force that changes more slowly, or simulate in parts, with steps of your own near this time."
+        )
+    return fewest
 
 
 def first_unseen(run: Simulation, drives: Events) -> float:
-    """Time of the first event with fewer than `NODES_OF_EVENT` nodes of the run; infinite without such an event."""
+    """Time of the first event with fewer than `NODES_OF_EVENT` nodes of the run, not before its start; infinite without
+    such an event."""
     if not drives.names:
         return np.inf
     least = NODES_OF_EVENT * node_distance(run.scheme, drives) * float(run.macro_dt)
     starts = (drives.times - drives.lengths)[drives.lengths < least * (1 - LENGTH_TOLERANCE)]
-    return float(starts.min(initial=np.inf))
+    return max(float(starts.min(initial=np.inf)), float(run.state.t))
 
 
 def _of_error(of: Callable, trial: Trial, certified: np.ndarray) -> np.ndarray:

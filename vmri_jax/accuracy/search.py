@@ -18,6 +18,7 @@ of two families, `vmri_jax.tune` compares the best of many.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 
@@ -25,6 +26,7 @@ import numpy as np
 
 from vmri_jax.accuracy.companions import (
     FEWEST_DIVIDED,
+    MOST_STEPS,
     Trial,
     check_function_of_run,
     companion,
@@ -61,8 +63,6 @@ MANY_STEPS = 100_000
 FEWEST_STEPS = 16
 """Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A
 larger value makes searches with large accuracies slower."""
-MOST_STEPS = 2**22
-"""Macro steps of the longest trial. With a larger value searches for an accuracy out of reach take minutes."""
 MOST_GROWTH = 64
 """Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach,
 as with jumps of forces, ends with fewer steps than it could take; with a smaller one it repeats runs more often."""
@@ -195,9 +195,15 @@ class Search:
         return [self.accurate(trial, accuracy) for trial in chosen]
 
     def first_trials(self, menu: Sequence[Family], accuracy: float) -> list[Trial]:
-        """A trial of each family, which the search makes once: without the fallback, since steps that are too large for
-        the motion fail with any method, and with it only if no scheme of the menu succeeds without it."""
-        limit, trials = np.inf, []
+        """A trial of each family whose steps can see all events, refused if there is none. The search makes each trial
+        once: without the fallback, since steps that are too large for the motion fail with any method, and with it only
+        if no scheme of the menu succeeds without it."""
+        seeing = []
+        for family in menu:
+            with suppress(Refused):
+                fewest_steps(family.scheme, self.drives, self.length)
+                seeing.append(family)
+        limit, trials, menu = np.inf, [], seeing or menu
         for family in menu:
             if family.expression not in self._firsts:
                 most_seconds = max(limit, LEAST_TRIAL_SECONDS)
@@ -248,7 +254,7 @@ class Search:
                 break
             wanted = min(before.steps_for(AIMED_PART * accuracy, order), MOST_GROWTH * run.num_steps)
             num_steps = self.beside_resonances(before, wanted)
-            if num_steps > max(MOST_STEPS, fewest_steps(run.scheme, self.drives, self.length)):
+            if num_steps > MOST_STEPS:
                 break
             trial = self.trial(before.family, num_steps, accuracy)
             if trial.error <= accuracy:
@@ -357,9 +363,9 @@ class Search:
         unit = unit_of(self.system, run.scheme)  # the rates of the rules divide num_micro
         best = (macro_seconds / micro_seconds * fast / slow) ** (1 / (p + 1))
         best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
-        if min(time(num_micro), time(2 * num_micro)) < WORTH_COMPILING * time(best):
-            return []
         num_steps = max(1, round(run.num_steps * num_micro / best))  # micro steps of the same length
+        if num_steps > MOST_STEPS or min(time(num_micro), time(2 * num_micro)) < WORTH_COMPILING * time(best):
+            return []
         return [self.trial(replace(trial.family, first=best), num_steps)]
 
     @cached_property

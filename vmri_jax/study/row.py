@@ -86,7 +86,7 @@ def reference_solution(
         degree: polynomial degree of the path, with Gauss quadrature on every term.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
-    Events of forces are seen by every run, see `vmri_jax.mechanics.driving`.
+    Events of forces are seen by every run without `num_steps`, see `vmri_jax.mechanics.driving`.
 
     Returns:
         The finer of the two successive runs with the least difference in q; error_q and error_p are the largest
@@ -97,10 +97,10 @@ def reference_solution(
     """
     problem = problem_of("reference_solution", problem)
     run = prepare(problem, galerkin(1, degree, "gauss"), macro_dt=t_end / num_saves, num_steps=num_saves)
-    drives = events(problem.system, run.state, float(run.state.t) + t_end)
-    fewest = max(32, fewest_steps(run.scheme, drives, t_end))  # steps that see the events of forces
     first, halvings = num_steps, 1
     if first is None:
+        drives = events(problem.system, run.state, float(run.state.t) + t_end)
+        fewest = max(32, fewest_steps(run.scheme, drives, t_end))  # steps that see the events of forces
         first = num_saves * -(-fewest // num_saves)
         halvings = max(0, math.ceil(math.log2(max(MAX_STEPS, 2 * fewest) / first)))
     coarse, best, last_error = None, None, np.inf
