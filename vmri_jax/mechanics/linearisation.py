@@ -12,14 +12,14 @@ hold the configuration at rest. In both cases it is a `System`, to which every s
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm
-from vmri_jax.mechanics.arrays import QUICK
+from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.constraints import decomposed
 from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.motion import motion
@@ -294,7 +294,7 @@ def _key(term: Term) -> str:
     return f"potential {term.name}" if term.field == "potentials" else term.field.removesuffix("_potential")
 
 
-@partial(jax.jit, compiler_options=QUICK)
+@quickly_compiled
 def _expansion(system: System, state: State) -> dict[str, tuple]:
     """Slope and curvature of the kinetic energy in (q, v) at rest, and of potentials and constraints in q = (q_s, q_f).
 

@@ -82,11 +82,10 @@ class Layout:
         return replace(self, bodies=bodies, kinematics=kinematics)
 
     @property
-    def columns(self) -> dict[str | Key, np.ndarray]:
-        """Numbers of the coordinates of every body, and of every freedom of a joint, in (Q_s, Q_f), taken as one
-        vector."""
-        num_slow, places = self.ends[0], {**self.bodies, **self.freedoms}
-        return {name: place.numbers(num_slow) for name, place in places.items()}
+    def columns(self) -> dict[str, np.ndarray]:
+        """Numbers of the coordinates of every body in (Q_s, Q_f), taken as one vector."""
+        num_slow = self.ends[0]
+        return {name: place.numbers(num_slow) for name, place in self.bodies.items()}
 
     @property
     def numbers(self) -> dict[str | Key, np.ndarray]:

@@ -202,9 +202,8 @@ def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period:
 def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float) -> dict[str, Any]:
     """Fields of the `Advice` from the multipliers of a step of small motions, at macro_dt and at steps near it."""
     lower, upper = SCANNED_STEPS[0] * macro_dt, SCANNED_STEPS[1] * macro_dt
-    windows = _scan(linear, scheme, lower, upper, macro_dt)
-    growth = float(multipliers(linear, scheme, [macro_dt]).radius[0]) - 1
-    growth = growth if growth > TOLERANCE else 0.0
+    radius, windows = _scan(linear, scheme, lower, upper, macro_dt)
+    growth = radius - 1 if radius > 1 + TOLERANCE else 0.0
     step_findings = list(_step_findings(linear, scheme, macro_dt, growth, windows))
     safe = macro_dt
     for _ in range(MOST_SCANS if step_findings else 0):
@@ -212,7 +211,7 @@ def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float) -> dict[str,
         if not np.isnan(safe):
             break
         upper, lower = lower, lower / 3
-        windows = _scan(linear, scheme, lower, upper, upper) + windows
+        windows = _scan(linear, scheme, lower, upper, upper)[1] + windows
     findings = [*step_findings, *_kicks_in_phase(linear, scheme, macro_dt)]
     if (swap := linear.swapped()) is not None:
         findings.append(Finding("warning", "labels", *swap))
@@ -249,11 +248,14 @@ def _step_findings(linear: Linearisation, scheme, macro_dt: float, growth: float
             yield Finding("warning", kind, f"{where} There: {cause}", distance)
 
 
-def _scan(linear: Linearisation, scheme, lower: float, upper: float, point: float) -> list[Window]:
-    """Unstable windows of macro steps between lower and upper, measured on a grid that contains `point`."""
+def _scan(linear: Linearisation, scheme, lower: float, upper: float, point: float) -> tuple[float, list[Window]]:
+    """Spectral radius at the macro step `point`, and unstable windows between lower and upper, on a grid with this
+    point."""
     turn = linear.frequencies.max(initial=0.0) * (upper - lower)
     grid = np.linspace(lower, upper, int(np.clip(turn / RADIANS_PER_POINT, *POINTS)))
-    return measure(linear, scheme, np.union1d(grid, [point]), RESOLUTION)[1]
+    grid = np.union1d(grid, [point])
+    radius, windows = measure(linear, scheme, grid, RESOLUTION)
+    return float(radius[np.searchsorted(grid, point)]), windows
 
 
 def _margin(a: float, b: float, macro_dt: float) -> float:

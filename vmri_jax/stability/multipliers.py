@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
-from vmri_jax.mechanics.arrays import QUICK, quickly_compiled, whole_number
+from vmri_jax.mechanics.arrays import quickly_compiled, whole_number
 from vmri_jax.mechanics.invariants import all_constraints
 from vmri_jax.mechanics.linearisation import Linearisation, tangents
 from vmri_jax.mechanics.state import Movable, State, start_of
@@ -111,7 +111,7 @@ def multipliers(linear: Linearisation, scheme: SchemeLike, macro_dt) -> Multipli
     return Multipliers(values, vectors.astype(complex), growing)
 
 
-@partial(jax.jit, compiler_options=QUICK)
+@quickly_compiled
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest, for k lengths of the step."""
 
