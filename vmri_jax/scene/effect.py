@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from vmri_jax.mechanics.arrays import is_concrete, library
+from vmri_jax.mechanics.arrays import is_concrete, library, numbers_of, quickly_compiled
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.constraints import START, Rows
-from vmri_jax.mechanics.functions import check_arguments
+from vmri_jax.mechanics.functions import TracedOnce, check_arguments
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES, Bindable
@@ -260,7 +260,7 @@ def check_function(effect: Any, moved: bool) -> None:
         value = shape_of(f"{effect.name}: function", effect.called, *arguments)
         _check_value(effect, value, [x.shape for x in effect.positions(group)], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
-            rows = _rows(effect.called, *arguments)
+            rows = numbers_of(_rows(TracedOnce(effect.called), *arguments))
             if np.any(np.abs(rows.values) > rows.allowed(START)):
                 raise Refused(
                     f"{effect.name}: the positions at the start violate this constraint by "
@@ -269,7 +269,8 @@ def check_function(effect: Any, moved: bool) -> None:
                 )
 
 
-def _rows(constraint, *arguments) -> Rows:
+@quickly_compiled
+def _rows(constraint: TracedOnce, *arguments) -> Rows:
     """The `Rows` of a constraint of positions, its last argument but one."""
     *before, q, params = arguments
     flat, by_role = ravel_pytree(q)
