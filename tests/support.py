@@ -117,7 +117,7 @@ def states_near(problem, dimension: int):
     system, n_s = problem.system, problem.q_s.size
     q, v = np.concatenate([problem.q_s, problem.q_f]), np.concatenate([problem.v_s, problem.v_f])
     jacobian = jax.jit(jax.jacrev(lambda q: system.constraints(0.0, q[:n_s], q[n_s:])))(q)
-    rows = np.reshape(jacobian, (-1, q.size))
+    rows = np.asarray(jacobian).reshape(-1, q.size)
     tangents = np.linalg.svd(rows)[2][len(rows) :]
     assert dimension == 2 * len(tangents)
 

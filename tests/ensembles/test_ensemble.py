@@ -292,6 +292,7 @@ NO_STEP = {"macro_dt": None}
         ({"design": {"num_micro": [2.5]}, "num_micro": None}, r"num_micro is 2\.5; it must be a whole"),
         ({"design": {"macro_dt": [0.03]}} | NO_STEP, r"no whole number"),
         ({"design": {"macro_dt": [0.01]}}, r"macro_dt is a column and an argument"),
+        ({"design": {"num_micro": [1]}}, r"num_micro is a column and an argument"),
         ({"design": {"macro_dt": [-0.01]}} | NO_STEP, r"macro_dt is .*; it must be a positive number"),
         ({"design": Draws(4, {"num_steps": ("uniform", 1, 9)})} | NO_STEP, r"num_steps cannot be drawn"),
         ({"design": {"t": [0.0, 1.0]}}, r"vary changes t, so that t_end does not fix the number of steps"),
@@ -373,6 +374,17 @@ def test_a_function_of_rows_makes_the_problems(tmp_path):
     slower = lambda problem, row: own.faster(problem, row | {"speed": row["speed"] / 2})  # noqa: E731
     with pytest.raises(ValueError, match="operations of vary"):
         few(runs.path, system=chain(50.0), design=design, num_micro=None, vary=slower, resume=True)
+
+
+def test_a_function_of_rows_changes_params_in_place(tmp_path, stored):
+    def in_place(problem, row):
+        problem.system.params["omega"] = row["omega"]
+        return problem
+
+    system = chain(50.0)
+    runs = few(tmp_path / "runs.zarr", system=system, vary=in_place)
+    np.testing.assert_allclose(runs.open().q_f, vm.open_ensemble(stored).q_f, rtol=0, atol=1e-14)
+    assert float(system.system.params["omega"]) == 50.0
 
 
 def test_a_function_of_rows_with_dictionaries(tmp_path):

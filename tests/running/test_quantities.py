@@ -189,6 +189,9 @@ def test_a_batch_with_its_own_parameters():
     assert runs.to_xarray().sizes["lane"] == 2
     with pytest.raises(ValueError, match=r"this is a batch of runs; take one of them"):
         runs.columns()
+    of_time = vm.Problem(system, [], [0.1, 0.0], names=vm.Names(fast={"t": 1, "x": 1}))
+    with pytest.raises(ValueError, match=r"columns: t would be the name of two columns\. Give the body"):
+        runs.lane(0).of(of_time).columns()
 
 
 def spring(q_f, params):

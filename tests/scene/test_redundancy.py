@@ -150,8 +150,8 @@ def test_a_scene_that_drops_nothing_has_the_same_program():
 
 
 def test_a_hinge_far_from_the_origin_starts_closed():
-    """In orbit positions in metres are rounded to nanometres, more than a billionth of the bodies."""
-    place = np.array([4.2e7, -1.1e7, 7.3e6])
+    """As far as the moon positions in metres are rounded to 6e-8, more than a billionth of the bodies."""
+    place = [3.84e8, -1.1e8, 7.3e7]
     heights, shape = {"a": 0.1, "b": 1.3}, Cylinder(0.1, 1.0)
     bodies = [RigidBody(name, 1.0, shape, np.add(place, [0, 0, z]), [0.3, z, 0.1]) for name, z in heights.items()]
     hinge = Revolute(("a", "b"), np.add(place, [0.1, 0.2, 0.7]), Y)

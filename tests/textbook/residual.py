@@ -42,8 +42,8 @@ def residual(system, scheme, run: Trajectory, macro_dt) -> float:
     q_s, q_f, p_s, p_f = (np.asarray(getattr(run, name)) for name in NAMES)
     worst, largest = float(np.max(run.constraint_residual)), np.abs(np.hstack([p_s, p_f])).max()
     for k, inner in enumerate(np.asarray(run.q_f_micro)):
-        (d_slow, d_fast), values, jacobian = _equations(
-            system, scheme, q_s[k : k + 2], np.vstack([q_f[k], inner]), run.t[k], macro_dt
+        (d_slow, d_fast), values, jacobian = jax.device_get(
+            _equations(system, scheme, q_s[k : k + 2], np.vstack([q_f[k], inner]), run.t[k], macro_dt)
         )
         d_slow, d_fast = np.array(d_slow), np.array(d_fast)
         d_slow[[0, -1]] += p_s[k], -p_s[k + 1]

@@ -302,7 +302,7 @@ def started(setup: Transcription, start, num_steps: int, num_controls: int, grid
         controls = controls.reshape(shape)
     u = np.clip(controls, *setup.bounds)
     if nodes is None:  # controls start from the motion that they make, without gaps
-        nodes, _ = rolled(setup, u)
+        nodes = rolled(setup, u)
         if not np.isfinite(nodes).all():
             raise Refused("minimize: the motion with the first controls fails; give another start, or shorter steps.")
     return Point(nodes, u, np.zeros(0))

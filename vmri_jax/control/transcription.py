@@ -107,7 +107,7 @@ class Transcription(eqx.Module):
 
     @eqx.filter_jit
     def steps(self, z, u, follow):
-        """Ends (N, n) of all steps, NaN where a step fails, and their `StepStatus`.
+        """Ends (N, n) of all steps, NaN where a step fails.
 
         Each step starts from its node in z, or from the end of the step before if `follow` is true. One program
         computes both, since a step takes long to compile.
@@ -117,7 +117,7 @@ class Transcription(eqx.Module):
             node, u, k = stage
             end, status = self.step(jnp.where(follow, end, node), u, k)
             end = jnp.where(status.result <= Result.CONVERGED_AT_ROUNDOFF, end, jnp.nan)
-            return end, (end, status)
+            return end, end
 
         return jax.lax.scan(step, self.z_start, (self.before(z), u, jnp.arange(len(u))))[1]
 
@@ -247,8 +247,7 @@ def slope(setup: Transcription, point: Point, dz, du):
 
 
 def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float, Point]:
-    """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the point with its
-    gaps."""
+    """The solution of the linear-quadratic problem at a point, its largest absolute multiplier, the point with gaps."""
     stages, final = setup.linearised(point.z, point.u)
     point = point._replace(gaps=np.asarray(stages.c))
     limits = setup.limited(point.z, point.u) if setup.bounded else None
@@ -259,8 +258,7 @@ def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float,
             )
             raise bounded.Unsolved(f"minimize: values or derivatives of {name} are not finite. {elsewhere}")
     if limits is not None:
-        change, steepest = bounded.solve(stages, final, limits)
-        return change, steepest, point
+        return *bounded.solve(stages, final, limits), point
     change = riccati.solve(stages, final)
     if not all(np.isfinite(a).all() for a in change):
         lacking = "the second derivative of cost in u is not positive: without it controls have no least cost"
@@ -285,11 +283,10 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
         z, u = point.z + part * dz, point.u + part * du
         # the last term allows for round-off: near the optimum the merit changes by less
         allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (abs(cost) + rho * violation)
-        ends, _ = setup.steps(z, u, np.asarray(False))  # NaN where a step fails
-        motion, _ = rolled(setup, u)
-        trials = Point(z, u, np.asarray(ends) - z), Point(motion, u, np.zeros_like(motion))
-        measures = [measured(setup, trial) for trial in trials]
-        merits = [float(cost + rho * violation) for cost, violation, *_ in measures]
+        ends, motion = np.asarray(setup.steps(z, u, np.asarray(False))), rolled(setup, u)  # NaN where a step fails
+        trials = Point(z, u, ends - z), Point(motion, u, np.zeros_like(motion))
+        measures = [map(float, measured(setup, trial)) for trial in trials]
+        merits = [cost + rho * violation for cost, violation, *_ in measures]
         best = int(np.nanargmin([*merits, np.inf]))  # a motion that fails has the merit NaN
         if best < len(trials) and merits[best] <= allowed:
             accepted = trials[best]
@@ -298,18 +295,11 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
     if accepted is None:
         part, accepted = 0.0, point
     cost, _, size_z, size_u, miss, over = map(float, measured(setup, accepted))
-    record = {
-        "cost": cost,
-        "gap": float(np.abs(accepted.gaps).max()) / size_z,
-        "miss": miss,
-        "over": over,
-        "update": float(max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u)),
-        "part": part,
-    }
-    return accepted, record
+    gap, largest = np.abs(accepted.gaps).max() / size_z, max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u)
+    record = {"cost": cost, "gap": gap, "miss": miss, "over": over, "update": largest, "part": part}
+    return accepted, {name: float(value) for name, value in record.items()}
 
 
 def rolled(setup: Transcription, u):
-    """Nodes of the motion with controls u, NaN from the first failed step on, and the `StepStatus` of the steps."""
-    nodes, status = setup.steps(np.zeros((len(u), setup.z_start.size)), u, np.asarray(True))
-    return np.asarray(nodes), status
+    """Nodes of the motion with controls u, NaN from the first failed step on."""
+    return np.asarray(setup.steps(np.zeros((len(u), setup.z_start.size)), u, np.asarray(True)))

@@ -4,6 +4,7 @@ preparation, the checks of all arguments, its chunks, the arrays of its store, a
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
+from operator import is_
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -131,12 +132,15 @@ class Work:
             known = near(columns[0], (*STEPS, *SCHEMES))
             reason = f"the column {columns[0]!r} is neither a step nor a scheme"
             raise Refused(f"ensemble: {reason}.{known} Give vary= for it.")
-        changed = problem if self.vary is None else self.vary(problem, {name: row[name] for name in columns})
+        params = problem.system.params
+        # with dictionaries of its own, which `vary` may change in place
+        copied = replace(problem, system=problem.system.with_params(jax.tree.map(lambda leaf: leaf, params)))
+        changed = copied if self.vary is None else self.vary(copied, {name: row[name] for name in columns})
         check_type("ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...)")
         _check_only_values_differ(problem, changed)
         if "t_end" in self.steps and changed.t is not problem.t:
             raise Refused("ensemble: vary changes t, so that t_end does not fix the number of steps; give num_steps.")
-        is_same = changed.system.params is problem.system.params
+        is_same = all(map(is_, jax.tree.leaves(changed.system.params), jax.tree.leaves(params)))
         return None if is_same else changed.system.params, tuple(getattr(changed, part) for part in START)
 
     @cached_property
@@ -221,7 +225,8 @@ class Work:
 
     def _steps(self, values: Mapping[str, Any]) -> tuple[Any, int]:
         """Macro step, a number or one for each run, and number of macro steps."""
-        twice = sorted(set(self.steps) & set(values))
+        arguments = self.steps if self.num_micro is None else {**self.steps, "num_micro": self.num_micro}
+        twice = sorted(set(arguments) & set(self.columns))
         if twice:
             raise Refused(f"ensemble: {', '.join(twice)} is a column and an argument; leave one of them out.")
         steps = {**self.steps, **{name: values[name] for name in STEPS if name in values}}

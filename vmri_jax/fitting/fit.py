@@ -254,8 +254,7 @@ class _Search:
         jacobians = [np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values)]
         gap = float(np.abs(gaps).max(initial=0.0))
         end = {"iterations": int(iterations), "success": bool(good), "gap": gap, "squares": squares}
-        residual = misses, GAP_WEIGHTS[-1] * np.sqrt(self.count) * gaps
-        change = self.change_by_half_steps(u, z, residual, jacobians)
+        change = self.change_by_half_steps(u, z, (misses, GAP_WEIGHTS[-1] * np.sqrt(self.count) * gaps), jacobians)
         return Fit.of(self.shooting, u, misses, jacobians, change, **end, again=partial(self.again, u, z))
 
     def change_by_half_steps(self, u, z, residual, jacobians) -> np.ndarray:

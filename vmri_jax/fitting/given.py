@@ -185,8 +185,7 @@ class Unknowns:
 
     def vector(self, parameters: Mapping):
         """All numbers in a row."""
-        xp = library(parameters)
-        return xp.concatenate([xp.ravel(parameters[name]) for name in self.unknowns])
+        return library(parameters).concatenate([parameters[name].reshape(-1) for name in self.unknowns])
 
     @property
     def labels(self) -> list[str]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.given import Measured, Unknowns
-from vmri_jax.mechanics.arrays import library, quickly_compiled
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.projection import mass_and_momentum
 from vmri_jax.mechanics.state import Problem, State, initial_state
@@ -175,8 +175,5 @@ class Shooting:
 
 def _phase(problem: Problem, state: State):
     """(2 n,) positions and velocities of a state."""
-    phase = state.q_s, state.q_f, *_velocity(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)
+    phase = state.q_s, state.q_f, *jax.jit(velocity)(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)
     return library(phase).concatenate(phase)
-
-
-_velocity = quickly_compiled(velocity)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.kernels.saddle import least_norm
+from vmri_jax.mechanics.arrays import apart
 from vmri_jax.mechanics.invariants import lagrangian, velocity, velocity_and_masses
 from vmri_jax.mechanics.projection import time_rates
 from vmri_jax.mechanics.state import State
@@ -69,7 +70,7 @@ def motion(system: System, state: State) -> Motion:
     free, responses = jnp.linalg.solve(mass, forces), jnp.linalg.solve(mass, jacobian.T)
     multipliers = least_norm(jacobian @ responses, jacobian @ free + gamma)
     a = free - responses @ multipliers
-    return Motion(v_s, v_f, a[:n_s], a[n_s:], multipliers)
+    return Motion(v_s, v_f, *apart(a, n_s), multipliers)
 
 
 def reaction_forces(system: System, state: State, chosen):

@@ -12,7 +12,7 @@ from vmri_jax import kernels
 from vmri_jax.kernels import matmul, matvec
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
-from vmri_jax.mechanics.arrays import library, numbers_of, quickly_compiled
+from vmri_jax.mechanics.arrays import apart, library, numbers_of, quickly_compiled
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -114,7 +114,7 @@ def project_momentum(system: System, state, guess=None, constraints=None, sparsi
         (p, v), masses = _with_constant_masses(system, q_s, q_f, p, constraints, sparsity), None
     else:
         p, v, masses = _with_masses(system, q_s, q_f, p, constraints, guess)
-    return p[:n_s], p[n_s:], v[:n_s], v[n_s:], masses
+    return *apart(p, n_s), *apart(v, n_s), masses
 
 
 def _with_constant_masses(system: System, q_s, q_f, p, constraints, sparsity: Sparsity | None):

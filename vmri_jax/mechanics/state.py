@@ -12,16 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import (
-    Known,
-    Number,
-    Numbers,
-    is_concrete,
-    is_known,
-    numbers_of,
-    of_one_type,
-    require_x64,
-)
+from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, is_known, of_one_type, require_x64
 from vmri_jax.mechanics.by_name import constraint_sizes, flat_system
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.consistent import consistent_momenta, project_positions
@@ -60,7 +51,7 @@ class State:
     p_f: Float[Numbers, "n_f"]
 
     def __eq__(self, other) -> Any:
-        return eqx.tree_equal(numbers_of(self), numbers_of(other))
+        return eqx.tree_equal(self, other)
 
     def __repr__(self) -> str:
         if not has_values(self) or np.ndim(self.t) or np.ndim(self.q_s) != 1:
@@ -175,8 +166,7 @@ def _checked_start(known: Known, project: bool, tolerance: float) -> tuple[State
     if not system.has_constant_mass:  # before the projection, which divides by the masses
         check_system(system, q_s, q_f)
         check_mass(system, q_s, q_f)
-    # copies: JAX takes the memory of arrays of NumPy as it is, and users go on writing to theirs; by NumPy, since for
-    # `jnp.array` the first array of each shape is a program
+    # copies: JAX takes the memory of arrays of NumPy as it is, and users go on writing to theirs
     state, violation = jax.device_put(jax.tree.map(np.array, _start(known.tree, project)))
     advice = (
         "projection did not reach the constraints; start closer to them."

@@ -114,11 +114,11 @@ class System(eqx.Module):
                 f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function kinetic(q_s, q_f, v_s, "
                 "v_f, params)."
             )
-        for field, kind in KINDS.items():
+        for field, kind in reversed(KINDS.items()):  # kinetic last: of swapped arguments the other one tells more
             if field == "potentials":
-                terms += [_checked(field, name, V, order) for name, V in _named(potentials or ()).items()]
+                terms[:0] = [_checked(field, name, V, order) for name, V in _named(potentials or ()).items()]
             elif given[field] is not None:
-                terms.append(_checked(field, kind.symbol, given[field], order))
+                terms.insert(0, _checked(field, kind.symbol, given[field], order))
         self.terms, self.params = tuple(terms), params
 
     kinetic = _argument("kinetic")

@@ -110,7 +110,7 @@ def steps_until(t_end, t, macro_dt) -> int:
     if not is_concrete((t_end, t, macro_dt)):
         raise Refused("simulate: t_end needs times that are known; under transformations of JAX give num_steps.")
     check_number("simulate: t_end", t_end)
-    steps = float((t_end - t) / macro_dt)
+    steps = (float(t_end) - float(t)) / float(macro_dt)
     whole = round(steps)
     if whole < 1:
         raise Refused(f"simulate: t_end is {t_end:g}, less than a macro step of {macro_dt:g} after the start at {t:g}.")

@@ -80,7 +80,7 @@ class Exports(Quantities):
         ...", energy, constraint residuals, and the work of the solver since the previous node.
 
         Raises:
-            ValueError: this is a batch.
+            ValueError: this is a batch, or two columns have one name.
         """
         names = self.names
         if np.ndim(self.energy) != 1:
@@ -90,16 +90,24 @@ class Exports(Quantities):
         if self.origin.knows_system:
             v_s, v_f = map(np.asarray, self.velocities)
             parts.insert(1, ("v ", v_s, v_f))
-        columns = {"t": rows["t"]}
+        columns = [("t", rows["t"])]
         for letter, slow, fast in parts:
-            labels = [*names.slow_coordinates, *names.fast_coordinates]
-            columns |= {letter + name: column for name, column in zip(labels, [*slow.T, *fast.T], strict=True)}
+            labels = [letter + name for name in (*names.slow_coordinates, *names.fast_coordinates)]
+            columns += zip(labels, [*slow.T, *fast.T], strict=True)
         position, velocity = rows["constraint_residual"].T
-        columns |= {"energy": rows["energy"], "constraint residual": position, "constraint rate": velocity}
+        columns += [("energy", rows["energy"]), ("constraint residual", position), ("constraint rate", velocity)]
         if self.error is not None:
-            shares = {"slow share": rows["error_slow"], "fast share": rows["error_fast"]}
-            columns |= {"error": self.error.positions} | {f"error, {name}": share for name, share in shares.items()}
-        return columns | {name: rows[name] for name in INFO}
+            shares = ("slow share", rows["error_slow"]), ("fast share", rows["error_fast"])
+            columns += [("error", self.error.positions), *((f"error, {name}", share) for name, share in shares)]
+        columns += [(name, rows[name]) for name in INFO]
+        by_name = dict(columns)
+        if len(by_name) < len(columns):
+            twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
+            raise Refused(
+                f"columns: {', '.join(twice)} would be the name of two columns. Give the body or coordinate another "
+                "name, or take to_xarray or save."
+            )
+        return by_name
 
     def to_csv(self, path) -> None:
         """Write `columns` to a .csv file, with a line of names; an existing file is replaced.

@@ -169,7 +169,8 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
         return []
     t, nodes = np.atleast_2d(t), Observables.of(table.reshape(-1, *table.shape[-2:]))
     kinetic, change = nodes.kinetic.max(axis=1), np.abs(nodes.energy - nodes.energy[:, :1])
-    roundoff_of_steps = (t.shape[1] - 1) * save_every * (ROUNDOFF_OF_STEP / macro_dt) ** 2 * nodes.rounding.max(axis=1)
+    of_a_step = (ROUNDOFF_OF_STEP / np.asarray(macro_dt)) ** 2 * nodes.rounding.max(axis=1)
+    roundoff_of_steps = (t.shape[1] - 1) * save_every * of_a_step
     roundoff = np.maximum(ROUNDOFF_OF_ENERGY * nodes.terms.max(axis=1), roundoff_of_steps)
     jumps = np.pad(np.abs(np.diff(nodes.volume)) > UNRESOLVED, ((0, 0), (1, 1)))
     beside = jumps[:, 1:-1] | jumps[:, :-2] | jumps[:, 2:]

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, overload
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.state import HasProblem, Problem, State
@@ -74,7 +73,7 @@ class Record(NamedTuple):
         expected, structure = jax.tree.flatten((run.state, run.blank_memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise Refused("the checkpoint was made by a version of vmri_jax whose steps remember something else")
-        state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
+        state, memory = jax.tree.unflatten(structure, jax.device_put(list(self.leaves)))
         return Cursor(state, memory, *map(np.asarray, (self.step, self.result, self.failed_at))), run
 
 

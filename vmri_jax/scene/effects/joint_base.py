@@ -6,7 +6,7 @@ For the letters see `vmri_jax.scene.effects.joints`.
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain, islice, repeat
 from typing import Any, ClassVar, Literal
 
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, library, numbers_of, quickly_compiled, real_array
+from vmri_jax.mechanics.arrays import is_concrete, library, numbers_of, real_array
 from vmri_jax.mechanics.constraints import START
 from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.mechanics.names import unknown
@@ -81,15 +81,6 @@ def within_reach(q, params):
 def distance(q, params):
     """A displacement, m."""
     return products(1, q, params)[..., 0]
-
-
-def _value(is_angle: bool, q, params):
-    return angle(q, params) if is_angle else distance(q, params)
-
-
-@partial(quickly_compiled, static_argnames="is_angle")
-def _value_and_rate(is_angle: bool, q, params, along):
-    return jax.jvp(lambda q: _value(is_angle, q, params), (q,), (along,))
 
 
 def coordinate(q, params):
@@ -169,18 +160,18 @@ class Joint(Effect):
     def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
         """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is
         between -pi and pi."""
-        return _value(*self._of_freedom(freedom, i, coordinates))
+        function, *arguments = self._of_freedom(freedom, i, coordinates)
+        return function(*arguments)
 
     def value_and_rate(self, freedom: str, i: int, coordinates: Mapping[str, Any], rates: Mapping[str, Any]):
         """As `value`, with its rate, for rates (..., n) of the coordinates of bodies."""
-        along = tuple(rates[name] for name in self.attached[i])
-        return numbers_of(_value_and_rate(*self._of_freedom(freedom, i, coordinates), along))
+        function, q, params = self._of_freedom(freedom, i, coordinates)
+        along = tuple(rates[name] for name in self.attached[i]), jax.tree.map(np.zeros_like, params)
+        return numbers_of(jax.jit(jax.jvp, static_argnums=0)(function, (q, params), along))
 
     def _of_freedom(self, freedom: str, i: int, coordinates: Mapping[str, Any]) -> tuple:
-        """Whether a freedom of the i-th pair is an angle, the coordinates of its bodies, and the params of its
-        products."""
-        q = tuple(coordinates[name] for name in self.attached[i])
-        return freedom in ANGLES, *numbers_of((q, self.params_of((i,), self.numbers(FREEDOMS[freedom]))))
+        q, function = (coordinates[name] for name in self.attached[i]), angle if freedom in ANGLES else distance
+        return function, *numbers_of((tuple(q), self.params_of((i,), self.numbers(FREEDOMS[freedom]))))
 
     @cached_property
     def triads(self) -> Any:
