@@ -6,7 +6,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.small_systems import moving_constraints
-from tests.stability.driven_systems import NONE, SYSTEMS, mathieu
+from tests.stability.driven_systems import SYSTEMS, mathieu
 from vmri_jax.hard_cases.cases import resolved
 from vmri_jax.stability.drive import drive_period, driven_motion
 
@@ -67,12 +67,14 @@ def mathieu_exponent(a: float, q: float) -> float:
 
 def drive(t, q_s, q_f, v_s, v_f, params):
     waves = jnp.sum(params["size"] * jnp.cos(params["omega"] * t))
-    return q_s, -q_f + waves + params["pulse"] * jnp.exp(-((t - 5) ** 2)) + params["chirp"] * jnp.cos(t * t)
+    along_an_arm = jnp.cos(q_s) * (waves * jnp.sin(q_s)) - jnp.sin(q_s) * (waves * jnp.cos(q_s))  # round-off
+    pulse = params["pulse"] * jnp.exp(-((t - 5) ** 2))
+    return along_an_arm, -q_f + waves + pulse + params["chirp"] * jnp.cos(t * t)
 
 
 def driven_by(size, omega, pulse=0.0, chirp=0.0) -> vm.Problem:
     params = {"size": np.array(size), "omega": np.array(omega), "pulse": pulse, "chirp": chirp}
-    return vm.Problem(vm.System(vm.ConstantMass(NONE, [1.0]), force=drive, params=params), NONE, [0.0])
+    return vm.Problem(vm.System(vm.ConstantMass([1.0], [1.0]), force=drive, params=params), [0.0], [0.0])
 
 
 @pytest.mark.parametrize(

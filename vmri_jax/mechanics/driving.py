@@ -9,6 +9,7 @@ The round-off of an entry may be all that it has, as of the generalised force on
 have no moment. It is neither an event nor a jump: an entry counts as constant within its round-off, which is measured.
 """
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -102,19 +103,19 @@ def events(system: System, state, t_end: float) -> Events:
     if not names or not t_end > t_0:
         return Events(names)
     configuration = generic(state, t_end - t_0)
-    program = partial(_sampled, system, names, configuration)
-    size = jax.eval_shape(program, jnp.zeros(1)).shape[1]
+    program = partial(_sampled, system, names)
+    size = jax.eval_shape(program, configuration, jnp.zeros(1)).shape[1]
     chunk = 2 ** int(np.log2(np.clip(CHUNK // size, PARTS, SAMPLES // PARTS)))
 
     def chunks(t: np.ndarray):
         padded = np.append(t, np.full(-len(t) % chunk, t[-1])).reshape(-1, chunk)
-        return (np.asarray(program(part)) for part in padded)
+        return (np.asarray(program(configuration, part)) for part in padded)
 
     def values(t: np.ndarray) -> np.ndarray:
         return np.concatenate([part[:, varying] for part in chunks(t)])[: len(t)]
 
     t = t_0 + (t_end - t_0) * _unit_times(chunk)
-    coarse, noise = next(chunks(t)), round_off(system, names, configuration, t)
+    coarse, noise = next(chunks(t)), round_off(program, configuration, t)
     num = int(np.clip(MOST_NUMBERS // max(1, np.count_nonzero(np.ptp(coarse, axis=0) > noise)), chunk, SAMPLES))
     t = t_0 + (t_end - t_0) * _unit_times(num)
     # Of the entries of many bodies, few vary: the others are not kept.
@@ -191,8 +192,8 @@ def _sampled(system: System, names: tuple[str, ...], configuration, times):
     return jax.vmap(entries)(times)
 
 
-def round_off(system: System, names: tuple[str, ...], configuration, times: np.ndarray) -> np.ndarray:
-    """(m,) the round-off of the entries of the terms `names`, `SAFETY` times their largest second difference
+def round_off(entries: Callable, configuration: tuple, times: np.ndarray) -> np.ndarray:
+    """(m,) the round-off of ``entries(configuration, times)``, (k, m), `SAFETY` times their largest second difference
 
         f(x) - 2 f(x + h) + f(x + 2 h),    x = (t, q_s, q_f, v_s, v_f)
 
@@ -204,7 +205,7 @@ def round_off(system: System, names: tuple[str, ...], configuration, times: np.n
     lines = []
     for k in range(3):
         t, *moved = (a + k * TINY * step for a, step in zip(x, h, strict=True))
-        lines.append(np.asarray(_sampled(system, names, tuple(moved), np.pad(t, 1, mode="edge"))))
+        lines.append(np.asarray(entries(tuple(moved), np.pad(t, 1, mode="edge"))))
     return SAFETY * np.abs(np.diff(lines, n=2, axis=0)[0]).max(axis=0)
 
 

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from vmri_jax.mechanics.driving import driven, generic, sampled_with_rates
+from vmri_jax.mechanics.driving import driven, generic, round_off, sampled_with_rates
 from vmri_jax.mechanics.linearisation import Linearisation
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
@@ -78,11 +78,12 @@ def drive_period(system: System, state: State, scale: float) -> float | None:
     names = driven(system, state)
     if not names or not 0 < scale < np.inf:
         return None
-    entries = partial(sampled_with_rates, system, names, generic(state, scale * SPANS[-1]))
+    configuration = generic(state, scale * SPANS[-1])
+    entries = partial(sampled_with_rates, system, names)
     start, random = float(state.t), np.random.default_rng(0)
     for span in scale * SPANS:
         step, times = span / SAMPLES, start + np.arange(SAMPLES) * span / SAMPLES
-        signal = _signal(entries, times)
+        signal = _signal(entries, configuration, times)
         before, anywhere = signal(times)[0], start + 16 * span * random.random(SAMPLES)
         windows = np.lib.stride_tricks.sliding_window_view(before, SAMPLES // 2)
         apart = np.square(windows - windows[0]).mean(axis=1)
@@ -98,14 +99,14 @@ def drive_period(system: System, state: State, scale: float) -> float | None:
     return None
 
 
-def _signal(entries: Callable, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
+def _signal(entries: Callable, configuration: tuple, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
     """One function of times (k,) for all entries, each in units of its amplitude, and its rate of change, (k,) both."""
-    values = np.nan_to_num(entries(times)[0], posinf=0.0, neginf=0.0)
-    amplitude = np.ptp(values, axis=0)
-    moves = amplitude > 1e-9 * np.abs(values).max(axis=0)
+    amplitude = np.ptp(entries(configuration, times)[0], axis=0)
+    # An entry counts if a period later its round-off keeps it the same.
+    moves = amplitude > round_off(lambda *at: entries(*at)[0], configuration, times) / SAME
     # weights by which no two entries cancel
     weights = np.where(moves, np.cos(1.0 + np.arange(moves.size)), 0.0) / np.where(moves, amplitude, 1.0)
-    return lambda times: tuple(np.nan_to_num(part) @ weights for part in entries(times))
+    return lambda times: tuple(np.nan_to_num(part) @ weights for part in entries(configuration, times))
 
 
 def periods_of_run(macro_dt: float, period: float) -> int:
