@@ -77,7 +77,7 @@ SHOWN = {
     "how_to/steppers.md": ("class Rotation",),
     "coming_from/index.md": ("25.0 * q_s[",),
     "how_to/measurements.md": ("",),
-    "how_to/scenes.md": ("crank pin",),
+    "how_to/scenes.md": ("crank pin", "a spring between"),
     "how_to/accuracy.md": ("hinge",),
 }
 
