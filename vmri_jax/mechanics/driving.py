@@ -258,10 +258,13 @@ def _events_of(t: np.ndarray, f: np.ndarray, height: float) -> tuple[np.ndarray,
     half = np.minimum(heights[1:], heights[:-1]) / 2
     # The variation v(t) = sum |df| grows by half a height on either side of a turning point.
     variation = np.append(0.0, np.cumsum(np.abs(steps)))
-    begin, end = (np.interp(variation[inner] + side * half, variation, t) for side in (-1, 1))
+    moves = slice(moving[0], moving[-1] + 2)  # without rest at both ends of the time
+    begin, end = (np.interp(variation[inner] + side * half, variation[moves], t[moves]) for side in (-1, 1))
     before, after = t[inner] - begin, end - t[inner]
     is_cut, is_cut_after = variation[inner] < half, variation[inner] + half > variation[-1]
-    return t[inner], np.where(is_cut, after, before) + np.where(is_cut_after, before, after)
+    # An event that an end cuts lasts until the end at least, or as long as on its other side.
+    longer = np.maximum(before, after)
+    return t[inner], np.where(is_cut, longer, before) + np.where(is_cut_after, longer, after)
 
 
 def _without_ripples(f: np.ndarray, turns: np.ndarray, height: float) -> np.ndarray:
