@@ -73,13 +73,14 @@ def library(*values):
     return np if is_concrete(values) else jnp
 
 
-def apart(vector, n_s: int) -> tuple:
+def apart(vector, n_s: int) -> tuple[Any, Any]:
     """The slow and the fast part of a vector (n_s + n_f,).
 
     An empty part is a constant: XLA ends the process while it compiles a program that returns an empty slice at the end
     of a concatenation (JAX 0.10.2).
     """
-    return tuple(part if part.size else np.zeros(0) for part in (vector[:n_s], vector[n_s:]))
+    slow, fast = (part if part.size else np.zeros(0) for part in (vector[:n_s], vector[n_s:]))
+    return slow, fast
 
 
 @lru_cache
