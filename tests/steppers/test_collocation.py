@@ -152,15 +152,6 @@ def test_it_solves_the_equations_of_the_step(make, scheme, macro_dt):
     assert largest_difference(*runs) / np.abs(runs[1]).max() < 1e-12  # measured 1e-14
 
 
-def test_round_off_hardly_grows_over_3000_steps(tsp):
-    """Inverses that an iteration uses at its root would add the same round-off in every step."""
-    by_modes, exact = (
-        vm.simulate(tsp, vm.galerkin(1, 4), macro_dt=1e-3, num_steps=3000, save=1000, solver=Solver(matrix)).p_f
-        for matrix in ("modes", "exact")
-    )
-    assert largest_difference(by_modes, exact) / np.abs(exact).max() < 2.5e-12  # measured 1.2e-12
-
-
 @pytest.mark.parametrize(("name", "bound"), [("tsp", 8), pytest.param("sam", 6, marks=pytest.mark.full)])
 def test_few_iterations_at_high_degree(name, bound, request):
     """Steps of about two thirds of a period of the stiff springs; the first of them settles the springs, the others the
