@@ -95,11 +95,12 @@ def multipliers(linear: Linearisation, scheme: SchemeLike, macro_dt) -> Multipli
     if not size:
         raise Refused(f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free.")
     lanes = int(np.clip(LANES * 36 // size, 4, LANES))
-    stages = np.outer(macro_dt, stage_lengths(scheme))
-    padded = np.pad(stages.ravel(), (0, -stages.size % lanes), mode="edge").reshape(-1, lanes)
+    # symmetric compositions have equal stages
+    lengths, stages = np.unique(np.outer(stage_lengths(scheme), macro_dt), return_inverse=True)
+    padded = np.pad(lengths, (0, -lengths.size % lanes), mode="edge").reshape(-1, lanes)
     fixed = linear.system, stage_scheme(scheme), linear.rest, linear.embed, linear.read
-    factors = np.concatenate([_step_matrices(*fixed, part) for part in padded])[: stages.size]
-    matrices = reduce(lambda a, b: b @ a, np.moveaxis(factors.reshape(*stages.shape, size, size), 1, 0))
+    factors = np.concatenate([_step_matrices(*fixed, part) for part in padded])
+    matrices = reduce(lambda a, b: b @ a, factors[stages.reshape(-1, macro_dt.size)])
     failed = ~np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
     values = np.where(failed[:, None], np.nan, values.astype(complex))
