@@ -188,7 +188,7 @@ def test_ctrl_c_keeps_the_chunk_at_work(tmp_path):
     assert few(tmp_path / "runs.zarr", **arguments, resume=True).complete
 
 
-def test_resume_computes_only_what_is_missing(tmp_path):
+def test_resume_computes_only_what_is_missing(tmp_path, monkeypatch):
     design = {"omega": np.linspace(20.0, 50.0, 40)}
     whole = few(tmp_path / "whole.zarr", design=design, chunk=8)
     part = few(tmp_path / "part.zarr", design=design, chunk=8)
@@ -199,6 +199,13 @@ def test_resume_computes_only_what_is_missing(tmp_path):
     data = vm.open_ensemble(part.path)
     assert int((data.result == -1).sum()) == 16
     assert int(data.p_f.isnull().any("fast").sum()) == 16
+    write = layout.Writer.write
+
+    def torn(writer, *arguments):  # as by a worker that is killed meanwhile
+        write(writer, *arguments)
+        (part.path / "p_f" / "c.0.0.5678.partial").touch()
+
+    monkeypatch.setattr(layout.Writer, "write", torn)
     resumed = few(part.path, design=design, chunk=8, resume=True)
     assert resumed.computed == 16
     assert _files(part.path) == _files(whole.path)

@@ -100,9 +100,15 @@ def writing(
         with explained(path, "Give another place."):
             _create(path, attributes, arrays, **design)
     with locked(path):
-        for file in path.rglob("*.partial"):  # of a `replaced` that was killed
-            file.unlink()
+        _remove_torn_files(path)
         yield
+        _remove_torn_files(path)  # of workers that were killed meanwhile
+
+
+def _remove_torn_files(path: Path) -> None:
+    """Remove files that a `replaced` has begun and, killed, has not ended."""
+    for file in path.rglob("*.partial"):
+        file.unlink()
 
 
 def _create(path: Path, attributes, arrays, dimension: str = "t", table=None) -> None:
