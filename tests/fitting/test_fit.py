@@ -40,7 +40,7 @@ def slow_position(state):
 
 
 def fit_of_two(data):
-    """The names are not in alphabetical order, in which JAX sorts those of a dictionary."""
+    """The names are not in alphabetical order, in which JAX sorts the names of a dictionary."""
     return vm.fit(CHAIN, data, {"v_s": CHAIN.v_s + 0.05, "omega": Unknown(19.5, lower=0)}, scheme=SCHEME, macro_dt=DT)
 
 

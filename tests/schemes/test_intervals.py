@@ -31,7 +31,7 @@ def control_points(equations, x: Unknowns):
 @jax.jit
 def whole_and_cut(equations, x):
     """The equations of the step from the textbook's action without kicks, with the fast position and the momenta at
-    its end, and those of its intervals."""
+    its end, and the values in its intervals."""
     system, scheme, t, H = equations.system, equations.scheme, equations.t, equations.macro_dt
     path, h, n = control_points(equations, x), equations.micro_dt, equations.scheme.num_micro
 

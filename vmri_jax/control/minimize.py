@@ -244,8 +244,8 @@ def transcribed(
         bounds=_bounds(bounds, num_controls),
         parts=parts,
     )
-    # The plan is that of a system with forces. A fallback is a branch of the compiled step: `jax.vmap` over all steps
-    # would compute both of its sides.
+    # The system of the plan has forces. A fallback is a branch of the compiled step: `jax.vmap` over all steps would
+    # compute both of its sides.
     driven = setup.driven(np.zeros((1, parts, num_controls)), state.t)
     return replace(setup, solver=solver or plan(driven, scheme, state).first)
 

@@ -42,7 +42,7 @@ def is_known(tree) -> bool:
 
 @jax.jit
 def _zero():
-    """A new array: this call takes 4 us, ``jnp.zeros(())`` 27 us."""
+    """A new array in 4 us; ``jnp.asarray(np.zeros(()))`` takes 27 us."""
     return 0
 
 

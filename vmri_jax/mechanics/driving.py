@@ -245,7 +245,7 @@ def _events(names: tuple[str, ...], t: np.ndarray, f: np.ndarray, jump: bool, le
 
 
 def _events_of(t: np.ndarray, f: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and lengths of the events of one entry f (k,) that are not lower than a height."""
+    """Times and lengths of the events of an entry f (k,) whose heights are at least `height`."""
     steps = np.diff(f)
     moving = np.flatnonzero(steps)
     turns = moving[1:][np.diff(np.sign(steps[moving])) != 0]

@@ -66,7 +66,7 @@ def _listed(argument: Any) -> tuple[Any, ...]:
 
 
 def items_of(about: str, argument: Any, kind: type, expected: str) -> tuple[Any, ...]:
-    """The items of a list of objects of one class, which messages call `expected`; `about` begins messages."""
+    """The items of a list whose items have one class, called `expected` in messages; `about` begins messages."""
     if isinstance(argument, kind) or not isinstance(argument, Iterable):
         raise Refused(f"{about} is {argument!r}; give a list.")
     items = tuple(argument)

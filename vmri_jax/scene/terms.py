@@ -283,5 +283,5 @@ def pick(values, select: Sequence[int]):
 
 
 def total(values: Sequence) -> Any:
-    """Sum of one or more arrays, or of pairs (slow, fast) of arrays."""
+    """Sum of at least one array, or of at least one pair (slow, fast) of arrays."""
     return jax.tree.map(lambda *parts: reduce(add, parts), *values)
