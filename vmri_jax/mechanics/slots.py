@@ -85,7 +85,8 @@ class Slots:
                 value = value.reshape(shape)
             elif per_row:  # the axes that the value lacks are the last ones, where NumPy would put them first
                 value = value.reshape(*seen, *(1,) * (len(shape) - value.ndim))
-            if value.shape != shape and not (per_row and _repeats(value.shape, shape)):
+            repeats = all(n in (1, full) for n, full in zip(value.shape, shape, strict=False))  # along axes of length 1
+            if value.shape != shape and not (per_row and value.ndim == len(shape) and repeats):
                 row = f"one number, an array {shape[:1]} with a number for each row, or" if per_row and shape else ""
                 raise Refused(
                     f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {row or 'an array of'} "
@@ -143,8 +144,3 @@ def check_computed(params: Any, changed: Any) -> None:
                 "fields instead, one for each value; jax.jit, grad and vmap may trace them, if every body has a pace "
                 "and every potential a rate."
             )
-
-
-def _repeats(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
-    """Whether an array of the first shape may be repeated along its axes of length 1 to fill the second shape."""
-    return len(shape) == len(whole) and all(n in (1, full) for n, full in zip(shape, whole, strict=True))

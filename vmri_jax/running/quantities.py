@@ -180,7 +180,7 @@ class Quantities:
         for of_constraint, numbers in zip(chosen, rows.values(), strict=True):
             of_constraint[numbers] = True
         chosen = np.broadcast_to(chosen, (*np.shape(states.t), *chosen.shape))  # at every node
-        forces, touched = at_nodes(_reaction_forces, self.origin, (states, chosen))
+        forces, touched = at_nodes(reaction_forces, self.origin, (states, chosen))
         first = {"s": 0, "f": self.states.q_s.shape[-1]}
         by_constraint: dict[str, dict] = {name: {} for name in rows}
         for body, (part, start, size) in names.bodies.items():
@@ -263,10 +263,6 @@ def _of_bodies(system: System, state: State, kinematics: Kinematics, kind: str):
     if kind == "velocity":
         return rates
     return tuple(system.params[MASS][part] * rate for part, rate in zip(("slow", "fast"), rates, strict=True))
-
-
-def _reaction_forces(system: System, node: tuple[State, Any]):
-    return reaction_forces(system, *node)
 
 
 def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:

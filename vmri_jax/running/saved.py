@@ -9,7 +9,6 @@ from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import psutil
 from jaxtyping import Int
@@ -88,16 +87,14 @@ class Saved(NamedTuple):
         unreached = number > module.where(breaks, len(number), after_step)[..., None, None]
         info = module.where(unreached, 0.0, nodes.info)
 
-        def without(_, column):
+        def marked(_, column, lost=lost):
             return module.where(lost, np.nan, column)
-
-        def slopes(_, column):
-            return jnp.where(lost & (column != 0), np.nan, column)
 
         # Derivatives of lost nodes are NaN, too. Those of `where` would be zero, which a search by gradients takes for
         # its goal; as solution of ``x = column`` a column has rules of its own in forward and in reverse mode.
-        solve = partial(jax.lax.custom_linear_solve, lambda x: x, solve=without, transpose_solve=slopes)
-        nodes = Columns(*map(partial(without, None) if module is np else solve, nodes))._replace(info=info)
+        solve = partial(jax.lax.custom_linear_solve, lambda x: x, solve=marked)
+        solve = partial(solve, transpose_solve=lambda _, slope: marked(_, slope, lost & (slope != 0)))
+        nodes = Columns(*map(partial(marked, None) if module is np else solve, nodes))._replace(info=info)
         failed_here = step + module.maximum(node * run.save_every - 1, 0)
         return Saved(nodes, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 
