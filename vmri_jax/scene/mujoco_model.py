@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.summary import listed
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, listed
+from vmri_jax.scene.body import GROUND
 
 CONSTRAINTS = "CONSTRAINT"
 """The flag that switches off contact, limits, dry friction and equalities at once."""
