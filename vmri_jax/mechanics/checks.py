@@ -101,7 +101,11 @@ def check_system(system: System, q_s, q_f) -> None:
                 f"{name} returns {describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
             )
         for part in shape if isinstance(shape, tuple) else (shape,):
-            _check_float64(term.place, part)
+            if part.dtype != np.float64:
+                raise Refused(
+                    f"{name} returns {part.dtype}; it must return float64. Whole numbers become floats as 0.0 instead "
+                    "of 0, arrays by .astype(float)."
+                )
     if system.implied is not None and not system.is_constrained:
         raise Refused(
             "System: implied is given, but neither constraint nor slow_constraint: its rows are watched, not solved "
@@ -212,14 +216,6 @@ def _line_of(error: Exception) -> str:
         if path.exists() and "site-packages" not in path.parts and package not in path.parents:
             return f", line {frame.lineno} of {path.name} ({frame.line})"
     return ""
-
-
-def _check_float64(name: str, value) -> None:
-    if value.dtype != np.float64:
-        raise Refused(
-            f"System: {name} returns {value.dtype}; it must return float64. Whole numbers become floats as 0.0 instead "
-            "of 0, arrays by .astype(float)."
-        )
 
 
 def describe(value) -> str:
