@@ -19,7 +19,7 @@ from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
-from vmri_jax.running.observables import LostEnergyWarning, concerns, observables
+from vmri_jax.running.observables import LostEnergyWarning, concerns, observed
 from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
@@ -227,7 +227,7 @@ class Quantities:
             ValueError: the run does not know its system.
         """
         self._check_concrete("concerns")
-        table, t = at_nodes(observables, self.origin, self.states), np.asarray(self.states.t)
+        (_, table), t = at_nodes(observed, self.origin, self.states), np.asarray(self.states.t)
         return concerns(table, t, self.origin.system(t.ndim - 1), np.ptp(t, axis=-1) / max(t.shape[-1] - 1, 1), 1)
 
     def _check_concrete(self, method: str) -> None:
