@@ -61,9 +61,7 @@ class Stage:
         pen = _Pen(axes, self.camera, self.theme, 72 * place[2] * figure.get_figwidth() / (2 * self.aspect))
         points = self.motion.at([time])[0]
         self._draw_around(pen, points)
-        t, start = self.motion.t, max(self.motion.t[0], time - trail)
-        count = int(np.clip(2 * np.sum((t >= start) & (t <= time)), *TRAIL_POINTS))  # with fewer it would be a zigzag
-        past = self.motion.at(np.linspace(start, time, count))
+        past = self.motion.at(self._trail_times(max(float(self.motion.t[0]), time - trail), time))
         drawing, bodies = self.motion.drawing, self.motion.drawing.bodies
         colors = [body.color or self.paces[body.pace] for body in bodies]
         balls = [i for i, body in enumerate(bodies) if body.shown == "ball"]
@@ -87,6 +85,11 @@ class Stage:
     def paces(self) -> dict[str, str]:
         """Colours of slow and of fast parts."""
         return {"slow": self.theme.curves[0], "fast": self.theme.curves[1]}
+
+    def _trail_times(self, start: float, end: float) -> np.ndarray:
+        """Times of the points of a trail, two for each node: with fewer points fast motion would be a zigzag."""
+        nodes = int(np.sum((self.motion.t >= start) & (self.motion.t <= end)))
+        return np.linspace(start, end, int(np.clip(2 * nodes, *TRAIL_POINTS)))
 
     def _draw_around(self, pen: "_Pen", points: np.ndarray) -> None:
         """Draw the planes with the shadows on them, and fixed spheres."""
