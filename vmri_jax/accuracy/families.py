@@ -138,16 +138,12 @@ def unit_of(system: System, scheme: SchemeLike) -> int:
 
 def seconds_of_steps(*runs: Simulation) -> np.ndarray:
     """Seconds of a macro step of each run, ``(T(2 n) - T(n)) / n``: the difference cancels the fixed cost of a call."""
-    timed = [_begin_of(run) for run in runs]
+    parts = np.divide(TIMED_SECONDS, least_seconds([run.in_pieces for run in runs], 1))  # the begin of longer runs
+    saves = [int(np.clip(run.num_saves * part, 1, run.num_saves)) for run, part in zip(runs, parts, strict=True)]
+    timed = [replace(run, num_steps=run.save_every * number) for run, number in zip(runs, saves, strict=True)]
     doubles = [replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every) for run in timed]
     calls = [run.in_pieces for run in (*timed, *doubles)]
     samples = int(np.clip(SAMPLED_SECONDS / (sum(least_seconds(calls, 1)) or np.inf), FEWEST_SAMPLES, MOST_SAMPLES))
     single, double = np.reshape(least_seconds(calls, samples), (2, -1))
     num_steps = [run.num_steps for run in timed]
     return np.maximum(double - single, LEAST_TIME * double) / num_steps  # noise may make the difference negative
-
-
-def _begin_of(run: Simulation) -> Simulation:
-    """The run, or its begin where the run takes longer than `TIMED_SECONDS`."""
-    saves = int(np.clip(run.num_saves * TIMED_SECONDS / least_seconds([run.in_pieces], 1)[0], 1, run.num_saves))
-    return replace(run, num_steps=run.save_every * saves)

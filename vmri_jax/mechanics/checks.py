@@ -70,8 +70,7 @@ def check_params(params) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         name = f"System: params{jax.tree_util.keystr(path)}"
         check_precision(name, leaf)
-        dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
-        if getattr(dtype, "kind", "key of jax.random") not in "biufc":
+        if getattr((leaf if hasattr(leaf, "dtype") else np.asarray(leaf)).dtype, "kind", "a key") not in "biufc":
             raise Refused(
                 f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. Keep all other "
                 "objects inside the functions. A class of your own becomes a pytree by "
