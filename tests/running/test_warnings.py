@@ -81,7 +81,6 @@ CAUSES = {  # problem, scheme, macro step, steps, outcome
     "pole": (problem(in_angles, weight, [1.0, 0.0], [0.0, 0.001]), MIDPOINT, 0.002, 400, vm.SingularCoordinatesWarning),
     "lost energy, T(q, v)": (one(kinetic, **STIFF), EXPLICIT, 0.0205, 40, vm.LostEnergyWarning),
     "NaN, T(q, v)": (one(kinetic, **PASSES_ZERO), EXPLICIT, 0.01, 40, vm.Result.NON_FINITE),
-    "driven, T(q, v)": (one(kinetic, **DRIVEN), EXPLICIT, 0.05, 400, None),
 }
 
 
