@@ -51,16 +51,16 @@ def heavier(problem, row):
 
 def test_runs_are_those_of_simulate(tmp_path):
     schemes = {"explicit": vm.fully_explicit, "implicit": vm.fully_implicit}
-    axes = {"num_micro": [1, 4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[0]": [0.1, 0.3]}
+    axes = {"num_micro": [4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[0]": [0.1, 0.3]}
     save = ("end", "nodes", *(name for name in QUANTITIES if name not in ("end", "nodes")))
     how = {"vary": own.put, "t_end": 0.2, "save": save, "num_saves": 4}
     runs = vm.ensemble(chain(50.0, 1), schemes, axes, **how, out=tmp_path / "runs.zarr")
     assert runs.complete
-    assert len(runs) == 32
+    assert len(runs) == 16
     assert runs.failed_runs == 0
     assert "runs, 0 of them failed" in repr(runs)
     data = runs.open()
-    assert dict(data.sizes) | {"scheme": 2, "num_micro": 2, "num_steps": 2, "omega": 2, "v_s[0]": 2} == dict(data.sizes)
+    assert dict(data.sizes) | {"scheme": 2, "num_micro": 1, "num_steps": 2, "omega": 2, "v_s[0]": 2} == dict(data.sizes)
     for scheme, make in schemes.items():
         at = {"scheme": scheme, "num_micro": 4, "num_steps": 16, "omega": 50.0, "v_s[0]": 0.3}
         one = data.sel(at).load()
@@ -342,7 +342,7 @@ def test_several_schemes_need_a_column_in_a_table(tmp_path):
 
 def test_constrained_systems(tmp_path, tsp):
     design, save = {"v_s[0]": [0.0, 0.1]}, ("end", "constraint_residual")
-    how = {"macro_dt": 0.01, "num_steps": 10, "project": True, "num_saves": 5}
+    how = {"macro_dt": 0.01, "num_steps": 10, "project": True, "num_saves": 5, "solver": vm.Solver("masses")}
     runs = vm.ensemble(tsp, vm.fully_explicit(1), design, vary=own.put, save=save, **how, out=tmp_path / "tsp.zarr")
     data = runs.open()
     assert runs.failed_runs == 0
