@@ -1,12 +1,17 @@
 """Gradients of systems with an empty part, and with respect to lengths, against finite differences; sound runs under
 `jax_debug_nans`."""
 
+from functools import partial
+from importlib import import_module
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
 import vmri_jax as vm
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.running import engine, loops
 
 
@@ -113,3 +118,40 @@ def test_prepared_runs_and_batches():
     starts = jax.tree.map(lambda a: np.stack([a, a]), problem.state())
     batch = vm.simulate_batch(problem.system, scheme, starts, **STEPS)
     np.testing.assert_allclose(batch.q_f[1], prepared.q_f, atol=1e-14)
+
+
+def empty_slices(jaxpr):
+    """Operations that take an empty slice of a concatenation, in a program and its parts."""
+    axis_of = {eqn.outvars[0]: eqn.params["dimension"] for eqn in jaxpr.eqns if eqn.primitive.name == "concatenate"}
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name in ("slice", "split") and eqn.invars[0] in axis_of:
+            yield from [eqn] * any(output.aval.shape[axis_of[eqn.invars[0]]] == 0 for output in eqn.outvars)
+        for part in jaxprs_in_params(eqn.params):
+            yield from empty_slices(part)
+
+
+def on_a_line(q_s, q_f, params):
+    return q_f[:1] + params * q_f[1:] - 1
+
+
+HELD = vm.System(vm.ConstantMass([], [1.0, 1.0]), fast_potential=fast_spring, constraint=on_a_line)
+
+
+@pytest.mark.parametrize(
+    ("system", "start", "scheme"),
+    [CASES["no fast part"], CASES["T(q, v)"], (HELD, ([], [0.6, 0.4]), vm.fully_explicit(2))],
+)
+def test_programs_take_no_empty_slice_of_a_concatenation(system, start, scheme):
+    """On a single core XLA compiles such programs wrongly: calls of LAPACK without an implementation."""
+    system = system.replace(params=ONE)
+    state = vm.Problem(system, *start).state()
+
+    def run(state):
+        run = vm.simulate(system, scheme, state, **STEPS)
+        return run.q_s, run.q_f, run.energy
+
+    at_rest = linearise(system, state)
+    step_matrices = import_module("vmri_jax.stability.multipliers")._step_matrices
+    derivative = partial(step_matrices, system, scheme, at_rest.rest, at_rest.embed, at_rest.read)
+    for program, argument in ((run, state), (derivative, np.ones(1))):
+        assert not list(empty_slices(jax.make_jaxpr(program)(argument).jaxpr))

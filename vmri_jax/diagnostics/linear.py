@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.arrays import library, split_at
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
@@ -35,7 +35,7 @@ def phase_vector(state: State):
 def state_of(z, t, like: State) -> State:
     """The state of a phase vector (2 n,) at time t; `like` is any state of the system."""
     n_s, n = like.q_s.size, like.q_s.size + like.q_f.size
-    return State(t, *jnp.split(z, (n_s, n, n + n_s)))
+    return State(t, *split_at(z, n_s, n, n + n_s))
 
 
 def phase_step(system: System, scheme: SchemeLike, like: State, t, z, *, macro_dt, solver: Solver | None):

@@ -13,7 +13,7 @@ import numpy as np
 from vmri_jax.fitting.given import Measured, Unknown, Unknowns
 from vmri_jax.fitting.result import SINGULAR_VALUE_TOLERANCE, Fit, without_starts
 from vmri_jax.fitting.shooting import Shooting
-from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.arrays import split_at, whole_number
 from vmri_jax.mechanics.checks import check_number, check_type
 from vmri_jax.mechanics.places import Placed, places_of
 from vmri_jax.mechanics.slots import free
@@ -222,7 +222,7 @@ class _Search:
         """Jacobians of misses and gaps with their last weight, by the parameters and by the starts of the parts."""
 
         def joined(x):
-            u, z = jnp.split(x, [self.size])
+            u, z = split_at(x, self.size)
             parts = self.residual((u, z.reshape(shape)), (values, GAP_WEIGHTS[-1]))
             return jnp.concatenate([jnp.ravel(a) for a in parts])
 

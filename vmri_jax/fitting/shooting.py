@@ -18,7 +18,7 @@ import numpy as np
 
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.given import Measured, Unknowns
-from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.arrays import library, split_at
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.projection import mass_and_momentum
 from vmri_jax.mechanics.state import Problem, State, initial_state
@@ -162,7 +162,7 @@ class Shooting:
         problem = self.model(self.unknowns.at(u))
         system, n_s, n = problem.system, problem.q_s.size, problem.q_s.size + problem.q_f.size
         t = problem.t + number * (self.length * self.macro_dt)
-        phase = jnp.split(start, [n_s, n, n + n_s])
+        phase = split_at(start, n_s, n, n + n_s)
         return self._run(problem, initial_state(system, *phase, t=t, project=system.is_constrained))
 
     def _run(self, problem: Problem, state: State):

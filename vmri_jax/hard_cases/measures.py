@@ -14,6 +14,7 @@ from vmri_jax import diagnostics
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics.shadow import ShadowEnergy
 from vmri_jax.hard_cases.case import Outcome
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.observables import LostEnergyWarning
@@ -114,8 +115,9 @@ def constraints(trajectory: Trajectory) -> tuple[float, float]:
 
 
 def difference(a, b) -> float:
-    """Largest absolute difference of two arrays; infinite if one is not finite."""
-    return float(np.max(np.nan_to_num(np.abs(np.asarray(a) - np.asarray(b)), nan=np.inf), initial=0.0))
+    """Largest difference of two arrays over the largest value in b; infinite if one is not finite."""
+    largest = np.max(np.nan_to_num(np.abs(np.asarray(a) - np.asarray(b)), nan=np.inf), initial=0.0)
+    return float(largest / np.abs(b).max(initial=1e-300))
 
 
 def refusal(call) -> str:
@@ -166,13 +168,12 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[
     points, t = points[np.isfinite(points).all(axis=1)], along.t[0]
     n = points.shape[1] // 2
     for term in system.of_kind("potential"):
-        values = partial(lambda term, q: term(system.params, q_s=q[:n_s], q_f=q[n_s:])[None], term)
+        values = partial(lambda term, q: term.at(split_at(q, n_s), system.params)[None], term)
         yield term.place, values, points[:, :n]
     if not system.has_constant_mass:
-        parts = (n_s, n, n + n_s)
-        yield "kinetic", lambda z: system.kinetic_energy(*jnp.split(z, parts))[None], points
+        yield "kinetic", lambda z: system.kinetic_energy(*split_at(z, n_s, n, n + n_s))[None], points
     if system.is_constrained:
-        yield "the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), points[:, :n]
+        yield "the constraints", lambda q: system.constraints(t, *split_at(q, n_s)), points[:, :n]
 
 
 def _differences(function: Callable, points: np.ndarray) -> tuple[float, float]:

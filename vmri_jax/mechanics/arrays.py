@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, wraps
-from typing import Any, TypeAlias
+from itertools import pairwise
+from typing import Any, TypeAlias, overload
 
 import jax
 import jax.numpy as jnp
@@ -79,14 +80,19 @@ def library(*values):
     return np if is_concrete(values) else jnp
 
 
-def apart(vector, n_s: int) -> tuple[Any, Any]:
-    """The slow and the fast part of a vector (n_s + n_f,).
+@overload
+def split_at(vector, end: int, /) -> tuple[Any, Any]: ...
+@overload
+def split_at(vector, *ends: int) -> tuple[Any, ...]: ...
+def split_at(vector, *ends):
+    """The parts of a joined vector, between the indices `ends` along its last axis: ``q_s, q_f = split_at(q, n_s)``.
 
-    An empty part is a constant: XLA ends the process while it compiles a program that returns an empty slice at the end
-    of a concatenation (JAX 0.10.2).
+    Empty parts are constants: XLA compiles wrong programs, or ends the process, where a program takes an empty slice of
+    a concatenation (JAX 0.10.2, above all on a single core).
     """
-    slow, fast = (part if part.size else np.zeros(0) for part in (vector[:n_s], vector[n_s:]))
-    return slow, fast
+    bounds = [0, *ends, vector.shape[-1]]
+    empty = np.zeros((*vector.shape[:-1], 0), vector.dtype)
+    return tuple(vector[..., a:b] if a < b else empty for a, b in pairwise(bounds))
 
 
 @lru_cache

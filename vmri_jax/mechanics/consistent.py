@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm, regularized
-from vmri_jax.mechanics.arrays import is_known, library, quickly_compiled
+from vmri_jax.mechanics.arrays import is_known, library, quickly_compiled, split_at
 from vmri_jax.mechanics.constraints import configuration
 from vmri_jax.mechanics.projection import legendre, mass_and_momentum, project_momentum
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -38,19 +38,19 @@ def project_positions(system: System, t, q_s, q_f):
 
     # q <- q - D (G D)^+ g
     def corrected(_, q):
-        here = configuration(system, t, q[:n_s], q[n_s:], start.mass)
+        here = configuration(system, t, *split_at(q, n_s), start.mass)
         return q - directions @ least_norm(here.jacobian @ directions, here.values)
 
     if xp is jnp:
         q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q)  # a loop, since its body is compiled once
-        return q[:n_s], q[n_s:]
+        return split_at(q, n_s)
     with (
         np.errstate(all="ignore"),
         suppress(np.linalg.LinAlgError),
     ):  # of positions that are not finite, which the checks name
         for k in range(PROJECTION_STEPS):
             q = corrected(k, q)
-    return q[:n_s], q[n_s:]
+    return split_at(q, n_s)
 
 
 def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
@@ -63,7 +63,7 @@ def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
     n_s, arguments = np.shape(q_s)[0], (system, t, q_s, q_f, v_s, v_f)
 
     def kinetic(v):
-        return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
+        return system.kinetic_energy(q_s, q_f, *split_at(v, n_s))
 
     v = library(v_s, v_f).concatenate([v_s, v_f])
     is_quadratic = system.has_constant_mass or has_constant_hessian(kinetic, v)
@@ -73,7 +73,7 @@ def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
     xp = library(v, p, projected_p)
     size = xp.maximum(v @ p, projected_v @ projected_p)
     part = xp.where(size > 0, (v - projected_v) @ (p - projected_p) / xp.where(size > 0, size, 1.0), 0.0)
-    return projected_p[:n_s], projected_p[n_s:], xp.sqrt(xp.clip(part, 0.0, 1.0))
+    return *split_at(projected_p, n_s), xp.sqrt(xp.clip(part, 0.0, 1.0))
 
 
 @quickly_compiled

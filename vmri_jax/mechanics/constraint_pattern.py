@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels.band import Full, Sparsity, sparsity
-from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
+from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled, split_at
 from vmri_jax.mechanics.system import System
 
 MOST_ROWS_OF_FULL_MATRIX = 80
@@ -61,7 +61,7 @@ def _touched(system: System, n_s: int, q, moves, slow_too: bool):
 
     def constraints(q):
         values = system.constraints if slow_too else system.g
-        return values(jnp.zeros(()), q[:n_s], q[n_s:])
+        return values(jnp.zeros(()), *split_at(q, n_s))
 
     values, change = jax.linearize(constraints, q)
     changes = jnp.abs(jax.lax.map(change, moves))

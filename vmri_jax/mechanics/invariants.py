@@ -5,6 +5,7 @@ from operator import add
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.projection import have_closed_masses, project_momentum
 from vmri_jax.mechanics.slopes import slopes_at
 from vmri_jax.mechanics.state import State
@@ -34,8 +35,8 @@ def potential_energy(system: System, q_s, q_f):
 
 def lagrangian(system: System, n_s: int, q, v):
     """``T - V - W - sum_i V_i`` at positions and velocities (n_s + n_f,)."""
-    q_s, q_f = q[:n_s], q[n_s:]
-    return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]) - potential_energy(system, q_s, q_f)
+    q_s, q_f = split_at(q, n_s)
+    return system.kinetic_energy(q_s, q_f, *split_at(v, n_s)) - potential_energy(system, q_s, q_f)
 
 
 def energy(system: System, q_s, q_f, p_s, p_f):

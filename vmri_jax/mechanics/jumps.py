@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import quickly_compiled
+from vmri_jax.mechanics.arrays import quickly_compiled, split_at
 from vmri_jax.mechanics.invariants import lagrangian
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
@@ -150,7 +150,7 @@ def _on_line(system, state, line, s):
 
     def force(s):
         here, velocity = q + s * dq, v + s * dv
-        outside = system.forces(state.t + s * dt, here[:n_s], here[n_s:], velocity[:n_s], velocity[n_s:])
+        outside = system.forces(state.t + s * dt, *split_at(here, n_s), *split_at(velocity, n_s))
         return jax.grad(partial(lagrangian, system, n_s))(here, velocity) + jnp.concatenate(outside), velocity
 
     return jax.vmap(force)(s)

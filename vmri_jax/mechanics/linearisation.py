@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm
-from vmri_jax.mechanics.arrays import quickly_compiled
+from vmri_jax.mechanics.arrays import quickly_compiled, split_at
 from vmri_jax.mechanics.constraints import decomposed
 from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.motion import motion
@@ -306,10 +306,10 @@ def _expansion(system: System, state: State) -> dict[str, tuple]:
 
     def kinetic(z):
         q, v = jnp.split(z, 2)
-        return system.kinetic_energy(q[:n_s], q[n_s:], v[:n_s], v[n_s:])
+        return system.kinetic_energy(*split_at(q, n_s), *split_at(v, n_s))
 
     def force(q, v):
-        return jnp.concatenate(system.forces(state.t, q[:n_s], q[n_s:], v[:n_s], v[n_s:]))
+        return jnp.concatenate(system.forces(state.t, *split_at(q, n_s), *split_at(v, n_s)))
 
     def second_order(function, x):
         slope = jax.jacrev(function)
@@ -317,12 +317,12 @@ def _expansion(system: System, state: State) -> dict[str, tuple]:
 
     terms = {
         "kinetic": second_order(kinetic, jnp.concatenate([q, jnp.zeros_like(q)])),
-        "constraint": second_order(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]), q),
+        "constraint": second_order(lambda q: system.constraints(state.t, *split_at(q, n_s)), q),
         "force": jax.jacfwd(force, argnums=(0, 1))(q, v),
     }
     terms["slow"] = terms["fast"] = jnp.zeros_like(q), jnp.zeros((q.size, q.size))  # without V or W
     for term in system.of_kind("potential"):
-        terms[_key(term)] = second_order(lambda q, V=term: V(system.params, q_s=q[:n_s], q_f=q[n_s:]), q)
+        terms[_key(term)] = second_order(lambda q, V=term: V.at(split_at(q, n_s), system.params), q)
     # lambda = (G M^-1 G^T)^+ G M^-1 f of the force f = -dV/dq alone
     G = terms["constraint"][0]
     responses = jnp.linalg.solve(terms["kinetic"][1][q.size :, q.size :], G.T)
@@ -373,4 +373,4 @@ class _Quadratic:
 def _force(t, q_s, q_f, v_s, v_f, params):
     constant, by_v = params["other_force"]
     force = constant + params["force"] @ jnp.concatenate([q_s, q_f]) + by_v @ jnp.concatenate([v_s, v_f])
-    return force[: q_s.size], force[q_s.size :]
+    return split_at(force, q_s.size)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.kernels.saddle import least_norm
-from vmri_jax.mechanics.arrays import apart
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.invariants import lagrangian, velocity, velocity_and_masses
 from vmri_jax.mechanics.projection import time_rates
 from vmri_jax.mechanics.state import State
@@ -52,7 +52,7 @@ def motion(system: System, state: State) -> Motion:
     q, v = jnp.append(state.q_s, state.q_f), jnp.append(v_s, v_f)
 
     def constraints(t, q):
-        return system.constraints(t, q[:n_s], q[n_s:])
+        return system.constraints(t, *split_at(q, n_s))
 
     def rates(t, q):
         """``dg/dt`` along the velocities."""
@@ -70,7 +70,7 @@ def motion(system: System, state: State) -> Motion:
     free, responses = jnp.linalg.solve(mass, forces), jnp.linalg.solve(mass, jacobian.T)
     multipliers = least_norm(jacobian @ responses, jacobian @ free + gamma)
     a = free - responses @ multipliers
-    return Motion(v_s, v_f, *apart(a, n_s), multipliers)
+    return Motion(v_s, v_f, *split_at(a, n_s), multipliers)
 
 
 def reaction_forces(system: System, state: State, chosen):

@@ -12,7 +12,7 @@ from vmri_jax import kernels
 from vmri_jax.kernels import matmul, matvec
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
-from vmri_jax.mechanics.arrays import apart, library, numbers_of, quickly_compiled
+from vmri_jax.mechanics.arrays import library, numbers_of, quickly_compiled, split_at
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -62,7 +62,7 @@ def _masses_of_function(system: System, q_s, q_f, v):
     masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
     if masses is not None:
         return masses, matvec(masses, v)
-    momentum = jax.grad(lambda v: system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :]))
+    momentum = jax.grad(lambda v: system.kinetic_energy(q_s, q_f, *split_at(v, q_s.size)))
     p, times_mass = jax.linearize(momentum, v)
     return jax.vmap(times_mass)(jnp.eye(p.size)), p
 
@@ -114,7 +114,7 @@ def project_momentum(system: System, state, guess=None, constraints=None, sparsi
         (p, v), masses = _with_constant_masses(system, q_s, q_f, p, constraints, sparsity), None
     else:
         p, v, masses = _with_masses(system, q_s, q_f, p, constraints, guess)
-    return *apart(p, n_s), *apart(v, n_s), masses
+    return *split_at(p, n_s), *split_at(v, n_s), masses
 
 
 def _with_constant_masses(system: System, q_s, q_f, p, constraints, sparsity: Sparsity | None):
@@ -122,7 +122,7 @@ def _with_constant_masses(system: System, q_s, q_f, p, constraints, sparsity: Sp
 
     def over_masses(p):
         """``M^-1 p`` for (..., n)."""
-        return jnp.concatenate(system.kinetic.velocity(p[..., : q_s.size], p[..., q_s.size :]), axis=-1)
+        return jnp.concatenate(system.kinetic.velocity(*split_at(p, q_s.size)), axis=-1)
 
     if rates.size:
         sparsity = sparsity or all_rows(system, q_s, q_f)
@@ -134,7 +134,7 @@ def _with_constant_masses(system: System, q_s, q_f, p, constraints, sparsity: Sp
 
 def _with_masses(system: System, q_s, q_f, p, constraints, guess):
     def kinetic(v):
-        return system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :])
+        return system.kinetic_energy(q_s, q_f, *split_at(v, q_s.size))
 
     v = gradient = jnp.zeros_like(p)
     masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
@@ -173,7 +173,7 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
     NaN without convergence."""
 
     def kinetic(system, q_s, q_f, v):
-        return system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :])
+        return system.kinetic_energy(q_s, q_f, *split_at(v, q_s.size))
 
     # Newton direction d:  [T'', G^T; G, 0] (d, mu) = (p - T'(v), -(G v + rates))
     def direction(data, v):

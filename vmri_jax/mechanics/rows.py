@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, chain, pairwise
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.arrays import library, split_at
 
 Part = Literal["s", "f"]
 
@@ -73,17 +73,16 @@ class Entries:
         """(..., count) the entries of vectors (..., n)."""
         if self.count == self.size:
             return vectors
-        return jnp.concatenate([vectors[..., :0], *(vectors[..., start:stop] for start, stop in self.runs)], axis=-1)
+        taken = split_at(vectors, *chain(*self.runs))[1::2]
+        return jnp.concatenate([np.zeros((*vectors.shape[:-1], 0)), *taken], axis=-1)
 
     def put(self, entries, vectors):
         """Vectors (..., n) with these entries replaced by `entries` (..., count)."""
         if self.count == self.size:
             return entries
-        pieces, end, taken = [], 0, 0
-        for start, stop in self.runs:
-            pieces += [vectors[..., end:start], entries[..., taken : taken + stop - start]]
-            end, taken = stop, taken + stop - start
-        return jnp.concatenate([*pieces, vectors[..., end:]], axis=-1)
+        kept = split_at(vectors, *chain(*self.runs))[::2]
+        new = split_at(entries, *accumulate(stop - start for start, stop in self.runs))
+        return jnp.concatenate([*chain(*zip(kept, new, strict=True))], axis=-1)
 
 
 @dataclass(frozen=True)

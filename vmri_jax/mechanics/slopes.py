@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.kernels import matvec, max_abs
-from vmri_jax.mechanics.arrays import Numbers, library
+from vmri_jax.mechanics.arrays import Numbers, library, split_at
 from vmri_jax.mechanics.structure import sizes_of_terms
 from vmri_jax.mechanics.system import System
 
@@ -101,7 +101,7 @@ def slopes_at(system: System, t, q_s, q_f) -> Slopes:
     n_s, q = q_s.shape[0], jnp.concatenate([q_s, q_f])
 
     def rows(t, q):
-        return jnp.concatenate([f(t, q[:n_s], q[n_s:]) for f in (system.constraints, system.g_implied)])
+        return jnp.concatenate([f(t, *split_at(q, n_s)) for f in (system.constraints, system.g_implied)])
 
     slopes = Slopes.of(partial(rows, t), q)
     if any(term.moves for term in system.terms):

@@ -89,6 +89,10 @@ class Term:
         """The value of the function, with its arguments by name among `values`."""
         return self.function(*self.of_arguments(values), params)
 
+    def at(self, positions, params):
+        """Its value at the positions (q_s, q_f)."""
+        return self(params, **dict(zip(POSITIONS, positions, strict=True)))
+
     def of_arguments(self, values) -> list:
         """Its arguments, in order, out of a mapping by name."""
         return [values[name] for name in self.arguments]

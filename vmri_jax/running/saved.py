@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 from jaxtyping import Int
 
-from vmri_jax.mechanics.arrays import Numbers, is_concrete, library
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, split_at
 from vmri_jax.mechanics.state import State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.observables import Observables, fault, is_right
@@ -50,7 +50,7 @@ class Columns(NamedTuple):
 
     def split(self, rows) -> "Columns":
         """The arrays of rows (..., numbers) with these slices."""
-        return Columns(*(rows[..., column] for column in self))
+        return Columns(*split_at(rows, *(column.stop for column in self[:-1])))
 
 
 class Saved(NamedTuple):

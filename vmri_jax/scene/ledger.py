@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics import invariants
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.names import Names
@@ -198,17 +199,17 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
     (n,)."""
 
     def lagrangian(q):
-        potentials = invariants.potential_energy(system, q[:n_s], q[n_s:])
+        potentials = invariants.potential_energy(system, *split_at(q, n_s))
         if system.has_constant_mass:
             return -potentials
-        return system.kinetic_energy(q[:n_s], q[n_s:], v_s, v_f) - potentials
+        return system.kinetic_energy(*split_at(q, n_s), v_s, v_f) - potentials
 
     def derivatives(q):
         total = jax.grad(lagrangian)(q)
         if system.is_constrained:
-            total += jax.jacrev(lambda q: system.constraints(0.0, q[:n_s], q[n_s:]))(q).sum(axis=0)
+            total += jax.jacrev(lambda q: system.constraints(0.0, *split_at(q, n_s)))(q).sum(axis=0)
         if system.force is not None:
-            total += jnp.concatenate(system.forces(0.0, q[:n_s], q[n_s:], v_s, v_f))
+            total += jnp.concatenate(system.forces(0.0, *split_at(q, n_s), v_s, v_f))
         return total
 
     return derivatives

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
+from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled, split_at
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
@@ -78,7 +78,7 @@ def _compiled_derivatives(functions: Sequence[TracedOnce], params, t, q_s, q_f):
     """Values and derivatives as of `_derivatives` of each function, which may be of the user: one program for all."""
 
     def values(q, function):
-        value = function(t, q[: q_s.size], q[q_s.size :], params)
+        value = function(t, *split_at(q, q_s.size), params)
         return value, value
 
     q = jnp.concatenate([q_s, q_f])
@@ -120,7 +120,7 @@ class ConstraintRows:
         q_bodies, by_coordinates = self.sorting.to_bodies(q)
         n_s, others = self.sorting.layout.ends[0], [term for term, is_analytic in self.terms if not is_analytic]
         functions = [TracedOnce(ConstraintValues("constraint", (term,))) for term in others]
-        arguments = self.params, float(t), q_bodies[:n_s], q_bodies[n_s:]
+        arguments = self.params, float(t), *split_at(q_bodies, n_s)
         of_others = iter(jax.device_get(_compiled_derivatives(functions, *arguments)) if others else ())
         parts = [
             _derivatives(term, self.params, t, q_bodies, n_s) if is_analytic else next(of_others)

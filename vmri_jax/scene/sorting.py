@@ -38,7 +38,7 @@ import jax
 import numpy as np
 from scipy.sparse import eye_array
 
-from vmri_jax.mechanics.arrays import is_concrete, library
+from vmri_jax.mechanics.arrays import is_concrete, library, split_at
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import DecidedPace, Layout
 from vmri_jax.scene.body import GROUND, Bodies, joined, label_of, listed
@@ -136,7 +136,7 @@ class Sorting:
         if self.layout.kinematics is not None:
             v, violation = _nearest_rates(self.to_bodies(self.assembled)[1], v, self.of_bodies("masses"))
             v = self._with_joint_starts(v, 1)
-        return (q[:n_s], q[n_s:], v[:n_s], v[n_s:]), violation
+        return (*split_at(q, n_s), *split_at(v, n_s)), violation
 
     def of_bodies(self, quantity: Literal["coordinates", "rates", "masses"]) -> Any:
         """A quantity of all bodies in the order of (Q_s, Q_f), with zeros for the freedoms of joints."""
@@ -150,7 +150,7 @@ class Sorting:
         if self.layout.kinematics is None:
             return q, eye_array(q.size)
         n_s = self.layout.sizes[0]
-        return self.layout.kinematics.with_jacobian(q[:n_s], q[n_s:], self.joints)
+        return self.layout.kinematics.with_jacobian(*split_at(q, n_s), self.joints)
 
     @cached_property
     def joints(self) -> dict[str, Any]:

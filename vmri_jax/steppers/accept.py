@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
-from vmri_jax.mechanics.arrays import Number
+from vmri_jax.mechanics.arrays import Number, split_at
 from vmri_jax.schemes.equations import StepEquations
 
 ROUNDOFF = 4.0
@@ -182,7 +182,7 @@ def constraint_length(equations: StepEquations, weights: Weights = NO_WEIGHTS):
         e = e / jnp.concatenate(weights)
 
     def along(q):
-        return jax.jvp(lambda q: system.constraints(equations.t, q[:n_s], q[n_s:]), (q,), (e,))[1]
+        return jax.jvp(lambda q: system.constraints(equations.t, *split_at(q, n_s)), (q,), (e,))[1]
 
     slope, curvature = (jnp.abs(a) for a in jax.jvp(along, (q,), (e,)))
     is_curved = curvature > 0

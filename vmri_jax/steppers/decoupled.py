@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.state import State
 from vmri_jax.steppers.kicked import Kicked, steps_in_words
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
@@ -88,8 +89,8 @@ class Joined(Stepper):
 
     def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
         end, info, memory = self.inner.advance(together(state), memory, macro_dt)
-        n_s, (q_s, q_f), (p_s, p_f) = self.num_slow, *(jnp.split(a, [self.num_slow]) for a in (end.q_f, end.p_f))
-        multiplier, slow_multiplier = jnp.split(info.multiplier, [self.num_constraints], axis=-1)
+        n_s, (q_s, q_f), (p_s, p_f) = self.num_slow, *(split_at(a, self.num_slow) for a in (end.q_f, end.p_f))
+        multiplier, slow_multiplier = split_at(info.multiplier, self.num_constraints)
         info = replace(
             info, q_f_micro=info.q_f_micro[:, n_s:], multiplier=multiplier, slow_multiplier=slow_multiplier[0]
         )

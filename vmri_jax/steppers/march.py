@@ -36,6 +36,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vmri_jax.kernels import matmul, matvec, max_abs
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights, largest
@@ -113,12 +114,13 @@ class MarchEquations:
 
     def by_name(self, z, x) -> Unknowns:
         """The inverse of `flat`."""
-        return Unknowns(
-            z[: self.num_slow].reshape(self.r, self.n_s),
-            z[self.num_slow :].reshape(self.r, self.n_gs),
-            x[:, : self.num_fast].reshape(self.n, self.r, self.n_f),
-            x[:, self.num_fast :].reshape(self.n, self.r, self.n_g),
-        )
+        fast, multiplier = (part.reshape(self.n, self.r, -1) for part in split_at(x, self.num_fast))
+        return Unknowns(*self._slow_by_name(z), fast, multiplier)
+
+    def _slow_by_name(self, z):
+        """The slow increments (r, n_s) and multipliers (r, n_gs) in z."""
+        slow, multiplier = split_at(z, self.num_slow)
+        return slow.reshape(self.r, self.n_s), multiplier.reshape(self.r, self.n_gs)
 
     def slow_size(self, z):
         """Largest slow increment in z, or in its correction."""
@@ -150,7 +152,7 @@ class MarchEquations:
         return rows, _gradients(on)
 
     def _named(self, x) -> IntervalUnknowns:
-        fast, multiplier = jnp.split(x, [self.num_fast])
+        fast, multiplier = split_at(x, self.num_fast)
         return IntervalUnknowns(fast.reshape(self.r, self.n_f), multiplier.reshape(self.r, self.n_g))
 
     def _by_node(self, slow):
@@ -158,13 +160,13 @@ class MarchEquations:
 
     def slow_equations(self, z, arriving: FlatArriving):
         """Residual (b,) of the slow equations, and the slow momentum at the end."""
-        slow, multiplier = z[: self.num_slow].reshape(self.r, self.n_s), z[self.num_slow :].reshape(self.r, self.n_gs)
+        slow, multiplier = self._slow_by_name(z)
         impulses = self.intervals.slow_impulses(slow, multiplier)
         rows, p_s = self.intervals.slow_rows(slow, impulses, self._apart(arriving))
         return jnp.concatenate([rows.reshape(-1), self.intervals.slow_constraints(slow).reshape(-1)]), p_s
 
     def _apart(self, arriving: FlatArriving) -> Arriving:
-        p_f, start, slow = jnp.split(arriving.gradients, [self.n_f, self.n_f + self.n_v])
+        p_f, start, slow = split_at(arriving.gradients, self.n_f, self.n_f + self.n_v)
         return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_v))
 
     def slow_inverse(self, z, arriving: FlatArriving, sensitivities: FlatArriving):
@@ -332,9 +334,8 @@ def linearised_pass(
         by_arriving, by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, n_f))), (sensitivities, unit))
         by_arriving = by_arriving._replace(position=by_arriving.position.at[:, ends[1] :].set(jnp.eye(n_f)))
         by_all = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, by_arriving, by_slow)
-        (by_x, by_z, by_position), (hands_on, hands_on_by_z, hands_on_by_position) = (
-            jnp.split(a, ends, axis=1) for a in by_all
-        )
+        by_parts = (split_at(a, *ends) for a in by_all)
+        (by_x, by_z, by_position), (hands_on, hands_on_by_z, hands_on_by_position) = by_parts
         inverse = march.inverse(by_x, march.num_fast)
         # dx_m/dz = -(dR_m/dx_m)^-1 dR_m/dz, with the dependence of the arriving quantities on z inside dR_m/dz
         response = -matmul(inverse, by_z)

@@ -172,7 +172,7 @@ class SlowEquations(NamedTuple):
         def forces(q_s, v_s):
             total = jax.vmap(system.forces)(equations.t + c * H, q_s, q_f, v_s, v_f)[0]
             for term in potentials:
-                gradient = jax.grad(lambda q_s, q_f, term=term: term(system.params, q_s=q_s, q_f=q_f))
+                gradient = jax.grad(lambda q_s, q_f, term=term: term.at((q_s, q_f), system.params))
                 total -= jax.vmap(gradient)(q_s, q_f)
             return total
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import ConstantMass, WithMassMatrix
 from vmri_jax.mechanics.projection import closed_masses, have_closed_masses
@@ -103,7 +104,7 @@ class OfJoined(WithMassMatrix):
         values = dict(zip(self.arguments, values, strict=True))
         for slow, fast in (("q_s", "q_f"), ("v_s", "v_f")):
             if fast in values:
-                values[slow], values[fast] = values[fast][: self.num_slow], values[fast][self.num_slow :]
+                values[slow], values[fast] = split_at(values[fast], self.num_slow)
         first, *others = (term(params, **values) for term in self.terms)
         if self.terms[0].kind == "force":
             return jnp.zeros(0), jnp.concatenate(first)
@@ -114,7 +115,7 @@ class OfJoined(WithMassMatrix):
         return have_closed_masses(self.terms)
 
     def mass_matrix(self, q_s, q_f, params, *others):
-        return closed_masses(self.terms, q_f[: self.num_slow], q_f[self.num_slow :], params)
+        return closed_masses(self.terms, *split_at(q_f, self.num_slow), params)
 
 
 def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Scheme]:

@@ -17,6 +17,7 @@ from vmri_jax import plots
 from vmri_jax.accuracy.companions import Trial
 from vmri_jax.accuracy.families import Family, by_promise, families, for_system
 from vmri_jax.accuracy.search import Search
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.terms import Term
@@ -323,7 +324,7 @@ def prices(problem: Problem) -> dict[str | int, float]:
     system, n_s = problem.system, problem.q_s.size
 
     def gradient(term: Term) -> Callable:
-        return jax.grad(lambda q: term(system.params, q_s=q[:n_s], q_f=q[n_s:]))
+        return jax.grad(lambda q: term.at(split_at(q, n_s), system.params))
 
     q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
     return {term.name: seconds_each(gradient(term), q) for term in system.of_kind("potential")}
