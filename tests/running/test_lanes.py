@@ -54,8 +54,8 @@ def single(way: str, lane: int):
     )
 
 
-LONG = ("collocation", "composition")
-"""For --full: what a step of one lane decides for itself, the nested iteration has, too."""
+LONG = ("collocation", "composition", "kicks")
+"""For --full: what a step of one lane decides for itself, the nested iteration has, too; kicks are below."""
 
 
 @pytest.mark.parametrize("way", [pytest.param(way, marks=pytest.mark.full if way in LONG else ()) for way in WAYS])
