@@ -82,6 +82,7 @@ def test_what_is_no_number(fpu, junk: Any):
     [
         ({"springs": [1.0, "stiff"]}, r"params\['springs'\]\[1\] is 'stiff'; give arrays of numbers"),
         ({"omega": np.nan}, r"System: params\['omega'\] is nan, which is not finite"),
+        ({"noise": jax.random.key(0)}, r"(?s)System: params\['noise'\] is .*; give arrays of numbers"),
     ],
 )
 def test_bad_parameters(fpu, params, message):
@@ -90,6 +91,8 @@ def test_bad_parameters(fpu, params, message):
         start(fpu, system)
     with pytest.raises(vm.Refused, match=message):
         step(fpu, system)
+    with pytest.raises(vm.Refused, match=message):  # before any function gets them
+        vm.Problem(vm.System(vm.ConstantMass({}, {"a": 1.0}), params=params), {}, {"a": 0.0})
 
 
 def test_parameters_of_a_batch(fpu):

@@ -15,7 +15,7 @@ def definite(n: int):
     return a @ a.T + n * np.eye(n) + 0.1 * a  # close to symmetric definite
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 12, 20])
+@pytest.mark.parametrize("n", [1, 2, 5, 12, 20, 50])
 def test_solve_and_inverse(n):
     a, b = definite(n), np.random.default_rng(0).normal(size=(n, 3))
     several = np.stack([a, 2 * a.T])

@@ -167,6 +167,15 @@ def test_bad_input(changes, message):
         problem(**changes)
 
 
+@pytest.mark.parametrize("nothing", [{}, []])
+def test_no_bodies_by_name_are_a_vector_without_entries(nothing):
+    """Beside vectors and beside dictionaries."""
+    assert vm.Problem(vm.System(vm.ConstantMass({}, [2.0])), nothing, [1.0], v_f=[3.0]).state().p_f == 6.0
+    assert (
+        vm.Problem(vm.System(vm.ConstantMass({}, {"a": 2.0})), nothing, {"a": 1.0}, v_f={"a": 3.0}).state().p_f == 6.0
+    )
+
+
 def test_a_system_by_name_needs_a_problem():
     with pytest.raises(TypeError, match=r"q_f is a dictionary; give real numbers, or Problem"):
         vm.initial_state(CRANE_BY_NAME, [0.0], {"hook": [3.0, -4.0]}, [0.0], [0.0, 0.0])

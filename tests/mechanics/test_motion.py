@@ -16,7 +16,7 @@ def test_a_pendulum_by_the_formula():
     found = jax.jit(motion)(system, state)
     tension = MASS * (1.0 + GRAVITY * 0.8 * LENGTH) / LENGTH**2  # m (v^2 - g y) / L^2
     assert float(found.multipliers[0]) == pytest.approx(tension, rel=1e-13)
-    (pull,), touched = jax.jit(lambda state: reaction_forces(system, state, np.ones((1, 1), bool)))(state)
+    (pull,), touched = jax.jit(lambda state: reaction_forces(system, (state, np.ones((1, 1), bool))))(state)
     assert touched.all()
     assert np.allclose(pull, -tension * state.q_f, rtol=1e-13)
     assert np.allclose(found.a_f, pull / MASS - np.array([0.0, GRAVITY]), rtol=1e-13)

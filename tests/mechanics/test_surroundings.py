@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 import vmri_jax as vm
@@ -90,6 +91,13 @@ def by_default(q_s, q_f, params, k=1.0):
     return k * q_s[0] ** 2 / 2
 
 
+def by_own_attribute(q_s, q_f, params):
+    return by_own_attribute.k * q_s[0] ** 2 / 2
+
+
+by_own_attribute.k = 1.0
+
+
 def keyword(q_s, q_f, params, k):
     return k * q_s[0] ** 2 / 2
 
@@ -122,7 +130,7 @@ def changes():
     """For each kind of surroundings a function of stiffness 1, and a change to another stiffness."""
     spring, again = Spring(), Spring()
     energy, change = closure()
-    table = np.ones(())
+    table, series = np.ones(()), pd.Series({"k": 1.0})
     return {
         "global": (by_global, setting(here, "STRENGTH")),
         "helper": (lambda q, *_: strength() * q[0] ** 2 / 2, lambda k: setattr(here, "strength", lambda: k)),
@@ -137,6 +145,8 @@ def changes():
         ),
         "default": (by_default, lambda k: setattr(by_default, "__defaults__", (k,))),
         "operator of a dataclass": (lambda q, *_: law * q[0] ** 2 / 2, setting(law, "k")),
+        "attribute of the function": (by_own_attribute, setting(by_own_attribute, "k")),
+        "table of pandas": (lambda q, *_: series["k"] * q[0] ** 2 / 2, entry(series, "k")),
         "partial": (partial(keyword, k=table), table.fill),
         "closure": (energy, change),
         "attribute of self": (spring.energy, setting(spring, "k")),

@@ -175,6 +175,20 @@ def test_second_derivatives(second, steps, in_parts):
     np.testing.assert_allclose(jax.jit(second(jax.grad(cost)))(at), expected, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_derivatives_of_a_failed_run_are_no_numbers(derivative):
+    """From the failure on, and of the nodes before it they are numbers: a point that passes the pole of a logarithm."""
+    system = vm.System(vm.ConstantMass([], [1.0]), fast_potential=lambda q_f, params: -0.01 * jnp.log(1.0 - q_f[0]))
+
+    def position(v, number):
+        problem = vm.Problem(system, [], [0.0], [], v * jnp.ones(1))
+        return vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.1, num_steps=10).q_f[number, 0]
+
+    by_velocity = jax.jit(derivative(position))
+    assert float(by_velocity(3.0, 1)) == pytest.approx(0.1, rel=1e-3)  # the step; without the force equal to it
+    assert np.isnan(by_velocity(3.0, -1))
+
+
 def test_a_gradient_has_the_values_of_the_run():
     """The steps of both are the same, up to the round-off of their two programs: the value of a gradient is no Newton
     step beside the root."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.scene import Body, Cylinder, Gravity, MovingPivot, Revolute, RigidBody, RigidLink, Scene
+from vmri_jax.scene import Body, Cylinder, Gravity, JointSpring, MovingPivot, Revolute, RigidBody, RigidLink, Scene
 
 Y = [0.0, 1.0, 0.0]
 CARBON_DIOXIDE = {"O1": [-0.116, 0, 0], "C": [0, 0, 0], "O2": [0.116, 0, 0]}
@@ -140,6 +140,18 @@ def test_a_run_watches_what_was_dropped():
         run = vm.simulate_batch(system, vm.fully_explicit(1), states, macro_dt=0.01, num_steps=4, params=params)
     assert run.result.tolist() == [vm.Result.CONVERGED, vm.Result.NOT_IMPLIED]
     assert run.constraint_residual[0].max() < 1e-13  # measured 1e-15
+
+
+def test_a_door_on_two_hinges_turns_as_on_one():
+    """In joint coordinates all rows of the second hinge follow from the first one, so that no row is solved for."""
+    door, turn = RigidBody("door", 3.0, [0.3, 0.5, 0.4], [0.5, 0.0, 0.0]), JointSpring("upper", 5.0, neutral=1.0)
+    upper, lower = (Revolute(("ground", "door"), [0, y, 0], Y, name=name) for name, y in (("upper", 1), ("lower", -1)))
+
+    def angle(*hinges):
+        scene = Scene([door], [*hinges, turn], redundant="drop", coordinates="joint")
+        return vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.02, num_steps=5).q_s
+
+    np.testing.assert_allclose(angle(upper, lower), angle(upper), rtol=1e-12)
 
 
 def test_a_scene_that_drops_nothing_has_the_same_program():

@@ -14,7 +14,7 @@ from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.animation.parts import check_keys
-from vmri_jax.catalogue import find_problem
+from vmri_jax.catalogue import MODELS, find_problem
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.design import SCHEMES, STEPS, columns_of_problems
@@ -138,7 +138,7 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
 def _located(name: str, folder: Path) -> str:
     """The name of a system or function, with the path of its file, if it has one, relative to a folder."""
     file, colon, function = name.partition(":")
-    return f"{folder / file}{colon}{function}" if file.endswith((".py", ".xml", ".mjcf", ".urdf")) else name
+    return f"{folder / file}{colon}{function}" if file.endswith((".py", *MODELS)) else name
 
 
 @contextmanager

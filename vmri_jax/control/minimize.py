@@ -317,7 +317,7 @@ def _resampled(setup: Transcription, start: Optimum, num_steps: int):
         raise Refused(
             f"minimize: start is an Optimum of duration {duration:g}; num_steps macro steps last {expected:g}."
         )
-    if m != len(setup.bounds[0]) or old_nodes.shape[1] != setup.z_start.size:
+    if m != len(setup.bounds[0]) or old_nodes.shape[1] != phase_vector(setup.start).size:
         raise Refused("minimize: start is an Optimum of another system or other controls; give one of this problem.")
     t = float(setup.start.t) + setup.macro_dt * np.arange(1, num_steps + 1)
     nodes = np.stack([np.interp(t, np.asarray(run.t), column) for column in old_nodes.T], axis=1)

@@ -90,14 +90,9 @@ class Transcription(eqx.Module):
         """The state at node k."""
         return state_of(z, self.start.t + k * self.macro_dt, self.start)
 
-    @property
-    def z_start(self):
-        """The first state, (n,)."""
-        return phase_vector(self.start)
-
     def before(self, z):
         """Starts of the steps that end at the nodes z (N, n)."""
-        return jnp.concatenate([self.z_start[None], z[:-1]])
+        return jnp.concatenate([phase_vector(self.start)[None], z[:-1]])
 
     def step(self, z, u, k):
         """The end of the step from node k at z (n,) with controls u (parts, m), and the `StepStatus` of the step."""
@@ -119,7 +114,7 @@ class Transcription(eqx.Module):
             end = jnp.where(status.result <= Result.CONVERGED_AT_ROUNDOFF, end, jnp.nan)
             return end, end
 
-        return jax.lax.scan(step, self.z_start, (self.before(z), u, jnp.arange(len(u))))[1]
+        return jax.lax.scan(step, phase_vector(self.start), (self.before(z), u, jnp.arange(len(u))))[1]
 
     def stage_cost(self, z, u, z_next, k):
         """Trapezoidal rule: ``H (C(z_k, u) + C(z_{k+1}, u)) / 2``, its mean over the controls of the interval."""
@@ -302,4 +297,4 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
 
 def rolled(setup: Transcription, u):
     """Nodes of the motion with controls u, NaN from the first failed step on."""
-    return np.asarray(setup.steps(np.zeros((len(u), setup.z_start.size)), u, np.asarray(True)))
+    return np.asarray(setup.steps(np.zeros((len(u), phase_vector(setup.start).size)), u, np.asarray(True)))

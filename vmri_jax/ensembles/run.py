@@ -20,7 +20,7 @@ from vmri_jax.executors.executor import NotAWorker, as_done, executor_of, submit
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.mechanics.summary import summary
+from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.refusals import Refused
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -47,13 +47,11 @@ class EnsembleError(RuntimeError):
     def __init__(self, ensemble: "Ensemble"):
         self.ensemble, self.failures = ensemble, ensemble.failures
         number, error = next(iter(self.failures.items()))
-        ends = map(ensemble.chunks.ends, list(self.failures)[:5])
-        lanes = ", ".join(f"{first} to {last - 1}" for first, last in ends)
-        ellipsis = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
+        lanes = listed([f"{first} to {last - 1}" for first, last in map(ensemble.chunks.ends, self.failures)], 5)
         reason = f"{type(error).__name__}: {error}".rstrip(".").splitlines()[-1]
         count = ensemble.chunks.count
         super().__init__(
-            f"{len(self.failures)} of {count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {number}: "
+            f"{len(self.failures)} of {count} chunks could not be computed: runs {lanes}. Chunk {number}: "
             f"{reason}. {len(ensemble.done)} of {count} chunks are in {ensemble.path}; with resume=True only the "
             "missing ones are tried."
         )

@@ -340,7 +340,7 @@ def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: 
 
 def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     """In words and digests, by name, everything that the results depend on."""
-    about_run = identity(run, run.state).items()
+    about_run = identity(run).items()
     identity_record = {name: text for name, text in about_run if not name.startswith(("scheme", "macro_dt"))}
     for label, scheme in work.schemes.items():
         name = scheme if isinstance(scheme, str) else getattr(scheme, "__qualname__", None)

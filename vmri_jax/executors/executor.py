@@ -71,9 +71,7 @@ def in_worker(versions: dict[str, str], data: bytes, *plain):
     return task(*shared, *plain)
 
 
-@lru_cache(maxsize=4)
-def _unpacked(data: bytes) -> tuple[Callable, tuple]:
-    return pickle.loads(data)
+_unpacked = lru_cache(maxsize=4)(pickle.loads)
 
 
 @lru_cache(maxsize=1)

@@ -2,7 +2,7 @@
 
 Two modules define the same functions and constants: `plain`, the textbook form, and `cpu`, the tuned form. The
 environment variable VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is imported. `band`
-inverts matrices with many zeros. `inverse_in_loop` comes from `cpu` in both cases.
+inverts matrices with many zeros.
 """
 
 import os
@@ -18,7 +18,6 @@ if _name not in CHOICES:
 _chosen = CHOICES[_name]
 
 inverse = _chosen.inverse
-inverse_in_loop = cpu.inverse_in_loop
 matmul = _chosen.matmul
 matvec = _chosen.matvec
 max_abs = _chosen.max_abs

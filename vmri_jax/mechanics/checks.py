@@ -70,7 +70,8 @@ def check_params(params) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         name = f"System: params{jax.tree_util.keystr(path)}"
         check_precision(name, leaf)
-        if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
+        dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
+        if getattr(dtype, "kind", "key of jax.random") not in "biufc":
             raise Refused(
                 f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. Keep all other "
                 "objects inside the functions. A class of your own becomes a pytree by "
@@ -82,6 +83,7 @@ def check_params(params) -> None:
 
 def check_system(system: System, q_s, q_f) -> None:
     """Check the shapes of masses, and of the values of every user function at these positions, by tracing alone."""
+    check_params(system.params)
     n_s, n_f = q_s.shape[0], q_f.shape[0]
     if isinstance(system.kinetic, ConstantMass):
         for name, mass, n in (("slow", system.kinetic.slow_mass, n_s), ("fast", system.kinetic.fast_mass, n_f)):
@@ -101,7 +103,11 @@ def check_system(system: System, q_s, q_f) -> None:
                 f"{name} returns {describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
             )
         for part in shape if isinstance(shape, tuple) else (shape,):
-            _check_float64(term.place, part)
+            if part.dtype != np.float64:
+                raise Refused(
+                    f"{name} returns {part.dtype}; it must return float64. Whole numbers become floats as 0.0 instead "
+                    "of 0, arrays by .astype(float)."
+                )
     if system.implied is not None and not system.is_constrained:
         raise Refused(
             "System: implied is given, but neither constraint nor slow_constraint: its rows are watched, not solved "
@@ -212,14 +218,6 @@ def _line_of(error: Exception) -> str:
         if path.exists() and "site-packages" not in path.parts and package not in path.parents:
             return f", line {frame.lineno} of {path.name} ({frame.line})"
     return ""
-
-
-def _check_float64(name: str, value) -> None:
-    if value.dtype != np.float64:
-        raise Refused(
-            f"System: {name} returns {value.dtype}; it must return float64. Whole numbers become floats as 0.0 instead "
-            "of 0, arrays by .astype(float)."
-        )
 
 
 def describe(value) -> str:

@@ -210,7 +210,14 @@ def check_constraints(
             f"{abs(solved[worst]):.3e} (allowed: {allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); "
             f"{advice}"
         )
-    _check_implied(rows, len(solved), place)
+    implied, allowed = (a[len(solved) :] for a in (rows.values, rows.allowed(CONSTRAINT_TOLERANCE)))
+    opened = np.flatnonzero(~(np.abs(implied) <= allowed))
+    if opened.size:
+        raise Refused(
+            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} "
+            f"of implied are {implied[opened]} there (allowed: {allowed[opened]}). Take parameters for which they "
+            "follow, or hold them as constraint."
+        )
     for part in held:
         by_all, by_variables = rows.gradients[part.rows], rows.gradients[part.rows, part.variables]
         size = np.linalg.norm(by_all, axis=1)
@@ -294,17 +301,6 @@ def _check_gradients(system: System, state, held: list[Held], rows: ScaledRows, 
                 f"{part.term.field} vanishes at these positions, and no force along it can hold the constraint. A "
                 "square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
             )
-
-
-def _check_implied(rows: ScaledRows, solved: int, place: str) -> None:
-    values, allowed = rows.values[solved:], rows.allowed(CONSTRAINT_TOLERANCE)[solved:]
-    opened = np.flatnonzero(~(np.abs(values) <= allowed))
-    if opened.size:
-        raise Refused(
-            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} "
-            f"of implied are {values[opened]} there (allowed: {allowed[opened]}). Take parameters for which they "
-            "follow, or hold them as constraint."
-        )
 
 
 def _nearby(state, rows: ScaledRows, weights):

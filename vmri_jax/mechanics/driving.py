@@ -19,7 +19,6 @@ import numpy as np
 
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
-from vmri_jax.mechanics.terms import Term
 
 SAMPLES = 2**20
 """Samples in time of an entry.
@@ -82,8 +81,11 @@ def driven(system: System, state) -> tuple[str, ...]:
     """
     values = {"q_s": state.q_s, "q_f": state.q_f, "v_s": jnp.zeros_like(state.q_s), "v_f": jnp.zeros_like(state.q_f)}
     moving = [term for term in system.terms if "t" in term.arguments and term.kind != "implied"]
-    depends = (depends_on(partial(_at_time, term, system.params, values), jnp.zeros(()))[0] for term in moving)
-    return tuple(term.field for term, on_time in zip(moving, depends, strict=True) if on_time)
+
+    def depends_on_time(term) -> bool:
+        return depends_on(lambda t: term(system.params, t=t, **values), jnp.zeros(()))[0]
+
+    return tuple(term.field for term in moving if depends_on_time(term))
 
 
 def events(system: System, state, t_end: float) -> Events:
@@ -171,11 +173,6 @@ def _jumps(values, t: np.ndarray, f: np.ndarray, span: np.ndarray) -> bool:
     return bool(change >= LEAST_JUMP)
 
 
-def _at_time(term: Term, params, values: dict, t):
-    """The value of a term at a time."""
-    return term(params, t=t, **values)
-
-
 @partial(jax.jit, static_argnames="names")
 def _sampled(system: System, names: tuple[str, ...], configuration, times):
     """(k, m) entries of the terms `names` at the times (k,): forces, and values and rates of moving constraints."""
@@ -185,7 +182,7 @@ def _sampled(system: System, names: tuple[str, ...], configuration, times):
         parts = []
         for term in system.terms:
             if term.field in names:
-                value = partial(_at_time, term, system.params, values)
+                value = partial(lambda term, t: term(system.params, t=t, **values), term)
                 parts += value(t) if term.kind == "force" else jax.jvp(value, (t,), (jnp.ones_like(t),))
         return jnp.nan_to_num(jnp.concatenate(parts), posinf=0.0, neginf=0.0)
 

@@ -128,11 +128,11 @@ class WithMassMatrix(ABC):
 def _masses(name: str, masses):
     """Masses as `ConstantMass` takes them, as float64: lists and NumPy arrays as NumPy arrays, which keep all digits
     before 64-bit mode is on."""
-    if isinstance(masses, Mapping):
+    if isinstance(masses, Mapping) and masses:
         return {
             body: _positive(f"{name}[{body!r}]", real_array(f"{name}[{body!r}]", mass)) for body, mass in masses.items()
         }
-    masses = real_array(name, masses)
+    masses = real_array(name, [] if isinstance(masses, Mapping) else masses)  # without bodies a vector without entries
     if masses.ndim == 1:
         return _positive(name, masses)
     if masses.ndim != 2 or masses.shape[0] != masses.shape[1]:

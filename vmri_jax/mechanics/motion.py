@@ -73,13 +73,14 @@ def motion(system: System, state: State) -> Motion:
     return Motion(v_s, v_f, *split_at(a, n_s), multipliers)
 
 
-def reaction_forces(system: System, state: State, chosen):
+def reaction_forces(system: System, node: tuple[State, Any]):
     """Forces ``-G^T lambda`` (m, n_s + n_f) of m constraints, and (m, n_s + n_f) whether each acts on each coordinate.
 
     Args:
-        chosen: (m, rows) for each of them which rows of `constraint` and `slow_constraint`, joined, are its rows. They
-            are values and no part of the program, so that one program computes the forces of every constraint.
+        node: the state, and (m, rows) for each of them which rows of `constraint` and `slow_constraint`, joined, are
+            its rows: values and no part of the program, so that one program computes the forces of every constraint.
     """
+    state, chosen = node
     jacobians = jax.jacrev(system.constraints, argnums=(1, 2))(state.t, state.q_s, state.q_f)
     jacobian, multipliers = jnp.concatenate(jacobians, axis=1), motion(system, state).multipliers
     forces = -jnp.where(chosen, multipliers, 0.0) @ jacobian

@@ -95,7 +95,6 @@ class Rows:
     size: int
     stride: int
     runs: tuple[Run, ...]
-    single: bool
 
     @classmethod
     def of(cls, places: Sequence[Place], size: int | None = None) -> "Rows":
@@ -114,7 +113,7 @@ class Rows:
                 runs[-1] = last._replace(count=last.count + 1, same=again)
             else:
                 runs.append(Run(part, start, 1, False))
-        return cls(size or stride, stride, tuple(runs), len(places) == 1)
+        return cls(size or stride, stride, tuple(runs))
 
     @property
     def places(self) -> list[Place]:
@@ -127,7 +126,7 @@ class Rows:
 
     def take(self, q_s, q_f):
         """The rows of q_s and q_f, which may also be velocities; for a single place (..., n) arrays."""
-        if self.single:
+        if self.runs[0].count == len(self.runs) == 1:
             ((part, start, _, _),) = self.runs
             return (q_s if part == "s" else q_f)[..., start : start + self.size]
         pieces = []

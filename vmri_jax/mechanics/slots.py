@@ -1,7 +1,8 @@
 """The one map from names to the entries of a flat vector."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+import operator
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,7 +86,8 @@ class Slots:
                 value = value.reshape(shape)
             elif per_row:  # the axes that the value lacks are the last ones, where NumPy would put them first
                 value = value.reshape(*seen, *(1,) * (len(shape) - value.ndim))
-            if value.shape != shape and not (per_row and _repeats(value.shape, shape)):
+            lengths = [{1, full} if per_row else {full} for full in shape]  # of rows an axis of length 1 is repeated
+            if value.ndim != len(shape) or not all(map(operator.contains, lengths, value.shape)):
                 row = f"one number, an array {shape[:1]} with a number for each row, or" if per_row and shape else ""
                 raise Refused(
                     f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {row or 'an array of'} "
@@ -105,12 +107,12 @@ class Computed(str):
     __slots__ = ()
 
 
-def leaves_by_name(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> tuple[dict[str, Any], Any]:
+def leaves_by_name(tree: Any) -> tuple[dict[str, Any], Any]:
     """The leaves of a pytree of parameters by their names, ``springs.stiffness``, and its structure.
 
     The name of a leaf is `Computed` if one of its keys is.
     """
-    leaves, structure = jax.tree.flatten_with_path(tree, is_leaf)
+    leaves, structure = jax.tree.flatten_with_path(tree)
     names = (jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves)
     computed = (any(isinstance(getattr(key, "key", None), Computed) for key in path) for path, _ in leaves)
     kept = (Computed(name) if is_computed else name for name, is_computed in zip(names, computed, strict=True))
@@ -143,8 +145,3 @@ def check_computed(params: Any, changed: Any) -> None:
                 "fields instead, one for each value; jax.jit, grad and vmap may trace them, if every body has a pace "
                 "and every potential a rate."
             )
-
-
-def _repeats(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
-    """Whether an array of the first shape may be repeated along its axes of length 1 to fill the second shape."""
-    return len(shape) == len(whole) and all(n in (1, full) for n, full in zip(shape, whole, strict=True))

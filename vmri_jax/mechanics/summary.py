@@ -11,10 +11,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 
 MOST_LISTED = 6
-"""Most names or numbers in a line; of a longer list the first ones and the last one are shown.
-
-A larger number makes lines longer.
-"""
+"""Most names or numbers in a line or in a message. A larger number makes them longer and harder to read."""
 MOST_PARAMETERS = 12
 """Most entries of `params` in a line. A larger number makes lines longer."""
 
@@ -39,11 +36,9 @@ def has_values(tree) -> bool:
     )
 
 
-def listed(items: Sequence[str]) -> str:
-    """Items with commas between them; dots stand for the middle of a long list."""
-    if len(items) > MOST_LISTED:
-        items = [*items[: MOST_LISTED - 1], "...", items[-1]]
-    return ", ".join(items)
+def listed(items: Sequence[str], most: int = MOST_LISTED) -> str:
+    """The first `most` items with commas between them, and the number of the others."""
+    return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
 
 
 def numbers(values) -> str:
@@ -67,9 +62,7 @@ def parameters(params: Any) -> str:
     """Parameters by name, numbers by value and arrays by shape."""
     if not isinstance(params, Mapping):
         return "" if params is None else _short(params)
-    texts = [f"{name} = {_short(value)}" for name, value in params.items()]
-    more = [f"and {len(texts) - MOST_PARAMETERS} more"] if len(texts) > MOST_PARAMETERS else []
-    return ", ".join([*texts[:MOST_PARAMETERS], *more])
+    return listed([f"{name} = {_short(value)}" for name, value in params.items()], MOST_PARAMETERS)
 
 
 def _short(value) -> str:

@@ -15,6 +15,7 @@ behind a `jax.jit` or a cache of the user, which keep what they read first.
 import dataclasses
 import dis
 import hashlib
+import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
@@ -129,6 +130,7 @@ class Surroundings:
         if not of_library:
             self.have_code = True
             self._attributes |= attributes
+            self._namespaces += [vars(function)] if vars(function) else []
             there = function.__globals__.get
             around = [name for name in around if not (name in logs and isinstance(there(name), LOGS))]
             key += [self._read(name, there, name, _MISSING) for name in around]
@@ -173,6 +175,9 @@ class Surroundings:
         if is_of_library(kind.__module__) and not is_data:
             if kind.__hash__ is not None and not (callable(value) and inside):
                 return value
+            if hasattr(value, "__array__"):  # a table of pandas or xarray, whose numbers change in place
+                self._mutable = True
+                return kind, hashlib.sha256(pickle.dumps(value)).digest()
             if inside is not None:
                 return kind, *(self._read(name, inside.get, name, _MISSING) for name in list(inside))
             self._mutable = True

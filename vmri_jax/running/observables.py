@@ -101,7 +101,7 @@ def observed(system: System, state: State, macro_dt: Any = 0.0, tolerance: Any =
 
     A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes
     mu, and not the motion: only momenta that are saved are projected. `macro_dt` is H of the step that ends in the
-    state, `tolerance` of its solver.
+    state, `tolerance` of its solver; both are zero of a saved state.
     """
     slopes = slopes_at(system, state.t, state.q_s, state.q_f)
     solved = sum(system.num_constraints(state.q_s, state.q_f))
@@ -123,11 +123,6 @@ def observed(system: System, state: State, macro_dt: Any = 0.0, tolerance: Any =
     terms = sum(map(jnp.abs, parts)) + taken @ taken / 2
     values = sum(parts), *slopes.residual(v), *kept, kinetic, terms, rounding, volume
     return State(state.t, *phase), jnp.stack([jnp.asarray(value, dtype=float) for value in values])
-
-
-def observables(system: System, state: State):
-    """The `Observables` of a saved state, as an array (9,)."""
-    return observed(system, state)[1]
 
 
 def is_right(now: Observables) -> Any:

@@ -19,7 +19,7 @@ from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
-from vmri_jax.running.observables import LostEnergyWarning, concerns, observables
+from vmri_jax.running.observables import LostEnergyWarning, concerns, observed
 from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
@@ -180,7 +180,7 @@ class Quantities:
         for of_constraint, numbers in zip(chosen, rows.values(), strict=True):
             of_constraint[numbers] = True
         chosen = np.broadcast_to(chosen, (*np.shape(states.t), *chosen.shape))  # at every node
-        forces, touched = at_nodes(_reaction_forces, self.origin, (states, chosen))
+        forces, touched = at_nodes(reaction_forces, self.origin, (states, chosen))
         first = {"s": 0, "f": self.states.q_s.shape[-1]}
         by_constraint: dict[str, dict] = {name: {} for name in rows}
         for body, (part, start, size) in names.bodies.items():
@@ -227,7 +227,7 @@ class Quantities:
             ValueError: the run does not know its system.
         """
         self._check_concrete("concerns")
-        table, t = at_nodes(observables, self.origin, self.states), np.asarray(self.states.t)
+        (_, table), t = at_nodes(observed, self.origin, self.states), np.asarray(self.states.t)
         return concerns(table, t, self.origin.system(t.ndim - 1), np.ptp(t, axis=-1) / max(t.shape[-1] - 1, 1), 1)
 
     def _check_concrete(self, method: str) -> None:
@@ -263,10 +263,6 @@ def _of_bodies(system: System, state: State, kinematics: Kinematics, kind: str):
     if kind == "velocity":
         return rates
     return tuple(system.params[MASS][part] * rate for part, rate in zip(("slow", "fast"), rates, strict=True))
-
-
-def _reaction_forces(system: System, node: tuple[State, Any]):
-    return reaction_forces(system, *node)
 
 
 def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:

@@ -4,9 +4,11 @@ A program writes the numbers of a node as one row into one array: XLA on CPU wou
 column. Derivatives go column by column: the derivative of positions then has no part of that of the observables.
 """
 
+from functools import partial
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import psutil
 from jaxtyping import Int
@@ -84,7 +86,15 @@ class Saved(NamedTuple):
         lost = number >= module.where(breaks, node, after_step)[..., None, None]
         unreached = number > module.where(breaks, len(number), after_step)[..., None, None]
         info = module.where(unreached, 0.0, nodes.info)
-        nodes = Columns(*(module.where(lost, np.nan, column) for column in nodes))._replace(info=info)
+
+        def marked(_, column, lost=lost):
+            return module.where(lost, np.nan, column)
+
+        # Derivatives of lost nodes are NaN, too. Those of `where` would be zero, which a search by gradients takes for
+        # its goal; as solution of ``x = column`` a column has rules of its own in forward and in reverse mode.
+        solve = partial(jax.lax.custom_linear_solve, lambda x: x, solve=marked)
+        solve = partial(solve, transpose_solve=lambda _, slope: marked(_, slope, lost & (slope != 0)))
+        nodes = Columns(*map(partial(marked, None) if module is np else solve, nodes))._replace(info=info)
         failed_here = step + module.maximum(node * run.save_every - 1, 0)
         return Saved(nodes, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 

@@ -1,7 +1,7 @@
 """Bodies: points of a scene, blocks of general coordinates, frames, the ground, and the points of a body that effects
 act on."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -52,11 +52,6 @@ def entry(item: Any) -> str:
 def label_of(name: str) -> str:
     """The name of a body, or of a point in a body, in messages and drawings."""
     return name.label if isinstance(name, Attachment) else name
-
-
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """The first `most` names, for a message, which is hard to read with more, and the number of the others."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def moving(names: Iterable[str]) -> tuple[str, ...]:

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.summary import listed
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, listed
+from vmri_jax.scene.body import GROUND
 
 CONSTRAINTS = "CONSTRAINT"
 """The flag that switches off contact, limits, dry friction and equalities at once."""
@@ -211,11 +212,8 @@ class Compiled:
         """Name of an element in the scene: its name in the model, or else its number; "arm joint" if a body has the
         name "arm", too."""
         name = getattr(self.model, kind)(int(i)).name or f"{kind} {int(i)}"
-        return f"{name} {kind}" if name == GROUND or (kind != "body" and name in self._bodies) else name
-
-    @cached_property
-    def _bodies(self) -> set[str]:
-        return {self.model.body(b).name for b in range(self.model.nbody)}
+        is_body = self.mujoco.mj_name2id(self.model, self.mujoco.mjtObj.mjOBJ_BODY, name) >= 0
+        return f"{name} {kind}" if name == GROUND or (kind != "body" and is_body) else name
 
     def refuse(self, ignore: Collection[str]) -> None:
         """Raise ValueError with all features of the model that a scene does not express, except those in `ignore`, see

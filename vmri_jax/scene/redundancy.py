@@ -17,9 +17,10 @@ from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, START, rank_of
 from vmri_jax.mechanics.slopes import ROUNDING
+from vmri_jax.mechanics.summary import listed
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import Key
-from vmri_jax.scene.body import Bodies, listed
+from vmri_jax.scene.body import Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rigid import Rigidity

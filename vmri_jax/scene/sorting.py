@@ -39,9 +39,10 @@ import numpy as np
 from scipy.sparse import eye_array
 
 from vmri_jax.mechanics.arrays import is_concrete, library, split_at
+from vmri_jax.mechanics.summary import listed
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import DecidedPace, Layout
-from vmri_jax.scene.body import GROUND, Bodies, joined, label_of, listed
+from vmri_jax.scene.body import GROUND, Bodies, joined, label_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
 from vmri_jax.scene.trees import Branch, joint_constants, make_layout, with_weight

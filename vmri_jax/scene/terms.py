@@ -189,21 +189,14 @@ def stiffness_times(energy: Callable, q, v, params):
 
 @dataclass(frozen=True)
 class TangentDamping:
-    """``F = -beta K v``, K v the sum of `terms`, forces; beta is the parameter "stiffness"."""
+    """``F = -beta K v``, K v the sum of `terms`, forces by `stiffness_times`; beta is the parameter "stiffness".
+
+    The Hessian K of a potential is by the points or the freedoms of joints that the potential is a function of: by
+    other coordinates K would have a part ``dV/dx d^2x/dq^2``, which depends on the choice of the coordinates q.
+    """
 
     terms: tuple[EffectTerm, ...]
     name: str
-
-    @classmethod
-    def of(cls, potentials: Iterable[EffectTerm], name: str) -> "TangentDamping":
-        """Damping by the Hessians K of some potentials, each by the points or the freedoms of joints that the potential
-        is a function of: by other coordinates K would have a part ``dV/dx d^2x/dq^2``, which depends on the choice of
-        the coordinates q."""
-        terms = (
-            replace(term, function=Applied(stiffness_times, (term.function,)), arguments=ARGUMENTS["kinetic"])
-            for term in potentials
-        )
-        return cls(joined(terms), name)
 
     def forces(self, values, params):
         """Force on (q_s, q_f), as of `EffectTerm`."""

@@ -186,7 +186,7 @@ def constraint_length(equations: StepEquations, weights: Weights = NO_WEIGHTS):
 
     slope, curvature = (jnp.abs(a) for a in jax.jvp(along, (q,), (e,)))
     is_curved = curvature > 0
-    return jnp.max(jnp.where(is_curved, slope / jnp.where(is_curved, curvature, 1.0), 0.0))
+    return jnp.max(slope / jnp.where(is_curved, curvature, 1.0), where=is_curved, initial=0.0)
 
 
 def expected(moved, before):

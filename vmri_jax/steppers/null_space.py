@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
 
-from vmri_jax.kernels import inverse_in_loop
+from vmri_jax.kernels import inverse
 from vmri_jax.kernels.saddle import saddle
 
 
@@ -49,7 +49,7 @@ def motions(jacobian):
 def inverse_with_multipliers(a, b, c, nodes: int):
     """The inverse of ``[[A, B], [C, 0]]`` by elimination, regularised for dependent constraints
     (`vmri_jax.kernels.saddle`)."""
-    return inverse_in_loop(saddle(a, b, c) if b.shape[-1] else a)
+    return inverse(saddle(a, b, c) if b.shape[-1] else a)
 
 
 def inverse_without_multipliers(a, b, c, nodes: int):

@@ -16,8 +16,6 @@ from matplotlib.figure import Figure
 
 from vmri_jax import plots
 
-STYLE_FOLDER = Path(__file__).parent
-
 
 def write_page(path: Path, template: Path, **values) -> None:
     """Render a template to `path`.
@@ -26,7 +24,7 @@ def write_page(path: Path, template: Path, **values) -> None:
     """
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     algebra = f"linear algebra on {threads} {'thread' if threads == '1' else 'threads'}"
-    loader = jinja2.FileSystemLoader([template.parent, STYLE_FOLDER])
+    loader = jinja2.FileSystemLoader([template.parent, Path(__file__).parent])
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     text = environment.get_template(template.name).render(
         date=datetime.now().strftime("%-d %B %Y, %H:%M"),

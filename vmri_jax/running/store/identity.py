@@ -14,7 +14,6 @@ import numpy as np
 from vmri_jax.mechanics.checks import digest, operations
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.terms import KINDS, Named
 from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.simulation import Simulation
@@ -24,18 +23,18 @@ MOST_NUMBERS_PRINTED = 8
 makes messages about different runs longer."""
 
 
-def identity(simulation: Simulation, start: State) -> dict[str, str]:
+def identity(run: Simulation) -> dict[str, str]:
     """Everything that determines a run, as text by name.
 
     A function is identified by its name and by a digest of the operations that it traces to: a changed body with the
     same name makes another run.
     """
-    system, texts = simulation.system, {"solver": type(simulation.solver).__name__}
+    system, start, texts = run.system, run.state, {"solver": type(run.solver).__name__}
     for name in ("scheme", "solver", "macro_dt", "save_every"):
-        texts |= describe(name, getattr(simulation, name))
+        texts |= describe(name, getattr(run, name))
     for name in (*KINDS, "params"):
         texts |= describe(f"system.{name}", getattr(system, name))
-    texts |= describe("save_micro", simulation.save.micro) | describe("state", start)
+    texts |= describe("save_micro", run.save.micro) | describe("state", start)
     values = {"t": start.t, "q_s": start.q_s, "q_f": start.q_f, "v_s": start.q_s, "v_f": start.q_f}
     for term in system.terms:
         if not isinstance(term.function, ConstantMass):

@@ -15,7 +15,7 @@ from vmri_jax.running.export import DIMENSIONS, rows_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.observables import Observables, observables
+from vmri_jax.running.observables import Observables, observed
 from vmri_jax.running.origin import at_nodes
 from vmri_jax.running.progress import Progress, progress_to
 from vmri_jax.running.saved import BYTES_PER_NUMBER, Saved
@@ -92,7 +92,7 @@ def stream(
         "save_every": run.save_every,
         "save_micro": run.save.micro,
         "chunk": _chunk(run) if chunk is None else whole_number("stream: chunk", chunk, otherwise=", or None"),
-        "identity": identity(run, run.state),
+        "identity": identity(run),
         "made_with": environment(),
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
@@ -136,7 +136,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     # The start and the largest values so far, as a node before each chunk but the first: energies are compared with the
     # start of the run.
     start, has_warned = jax.tree.map(lambda a: a[None], run.state), False
-    before = at_nodes(observables, run.origin, start) if record.saved else np.zeros((0, len(Observables._fields)))
+    before = at_nodes(observed, run.origin, start)[1] if record.saved else np.zeros((0, len(Observables._fields)))
     while record.saved < rows and record.failed_at < 0:
         tell("simulating", record.saved, rows)
         # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.

@@ -15,7 +15,7 @@ from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, names, number, of_time, positive, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.springs import BetweenPoints
-from vmri_jax.scene.terms import TangentDamping
+from vmri_jax.scene.terms import ARGUMENTS, Applied, TangentDamping, joined, stiffness_times
 
 
 class Gravity(Effect):
@@ -297,5 +297,9 @@ class RayleighDamping(Effect):
 
     def terms(self, select, layout):
         terms = () if self.mass is None else super().terms(select, layout)
-        damped = [term for potential in self.of for term in potential.terms(range(len(potential.elements)), layout)]
-        return terms if self.stiffness is None or not damped else (*terms, TangentDamping.of(damped, self.name))
+        damped = [
+            replace(term, function=Applied(stiffness_times, (term.function,)), arguments=ARGUMENTS["kinetic"])
+            for potential in self.of
+            for term in potential.terms(range(len(potential.elements)), layout)
+        ]
+        return terms if self.stiffness is None or not damped else (*terms, TangentDamping(joined(damped), self.name))
