@@ -53,7 +53,7 @@ def test_map_of_stable_steps(vmri, tmp_path):
 
 
 def test_a_scene_is_simulated_and_drawn(vmri, tmp_path):
-    steps = ["--macro-dt", 0.01, "--steps", 20, "--num-micro", 4]
+    steps = ["--scheme", "fully-explicit", "--macro-dt", 0.01, "--steps", 20, "--num-micro", 4]
     code, text = vmri("simulate", "my.py:scene", *steps, "--out", "run.npz")
     assert code == 0, text
     with np.load(tmp_path / "run.npz") as arrays:

@@ -51,16 +51,16 @@ def heavier(problem, row):
 
 def test_runs_are_those_of_simulate(tmp_path):
     schemes = {"explicit": vm.fully_explicit, "implicit": vm.fully_implicit}
-    axes = {"num_micro": [1, 4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[0]": [0.1, 0.3]}
+    axes = {"num_micro": [4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[0]": [0.1, 0.3]}
     save = ("end", "nodes", *(name for name in QUANTITIES if name not in ("end", "nodes")))
     how = {"vary": own.put, "t_end": 0.2, "save": save, "num_saves": 4}
     runs = vm.ensemble(chain(50.0, 1), schemes, axes, **how, out=tmp_path / "runs.zarr")
     assert runs.complete
-    assert len(runs) == 32
+    assert len(runs) == 16
     assert runs.failed_runs == 0
     assert "runs, 0 of them failed" in repr(runs)
     data = runs.open()
-    assert dict(data.sizes) | {"scheme": 2, "num_micro": 2, "num_steps": 2, "omega": 2, "v_s[0]": 2} == dict(data.sizes)
+    assert dict(data.sizes) | {"scheme": 2, "num_micro": 1, "num_steps": 2, "omega": 2, "v_s[0]": 2} == dict(data.sizes)
     for scheme, make in schemes.items():
         at = {"scheme": scheme, "num_micro": 4, "num_steps": 16, "omega": 50.0, "v_s[0]": 0.3}
         one = data.sel(at).load()
@@ -137,8 +137,9 @@ def test_own_quantities_systems_and_units(tmp_path):
     assert data.reach.attrs["description"] == "Largest elongation of the first stiff spring."
     run = vm.simulate(chain(30.0, 2), vm.fully_explicit(3), macro_dt=0.02, num_steps=10, save=2)
     assert data.reach.sel(omega=30.0) == pytest.approx(float(np.abs(run.q_f[:, 0]).max()), abs=1e-14)
-    again = few(tmp_path / "module.zarr", system="tests.ensembles.own:slow_chain", design={"omega": [30.0]}, save="end")
-    assert np.allclose(again.open().q_f[0], data.q_f[1], rtol=0, atol=1e-13)
+    module = "tests.ensembles.own:slow_chain"
+    again = few(tmp_path / "module.zarr", system=module, design={"omega": axis}, save=save, num_saves=5)
+    assert np.array_equal(again.open().q_f, data.q_f)
 
 
 def test_failed_runs_have_a_status_and_others_do_not_notice(tmp_path):
@@ -330,7 +331,7 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, changes, mess
 
 
 def test_several_schemes_need_a_column_in_a_table(tmp_path):
-    schemes = {"a": vm.fully_explicit(2), "b": vm.fully_implicit(2)}
+    schemes = {"a": vm.fully_explicit(2), "b": vm.fully_explicit(3)}
     with pytest.raises(ValueError, match="give a column 'scheme'"):
         few(tmp_path / "runs.zarr", scheme=schemes, num_micro=None, design=Table({"omega": [1.0]}))
     design = Table({"omega": [20.0, 20.0], "scheme": ["b", "a"]})
@@ -341,7 +342,7 @@ def test_several_schemes_need_a_column_in_a_table(tmp_path):
 
 def test_constrained_systems(tmp_path, tsp):
     design, save = {"v_s[0]": [0.0, 0.1]}, ("end", "constraint_residual")
-    how = {"macro_dt": 0.01, "num_steps": 10, "project": True, "num_saves": 5}
+    how = {"macro_dt": 0.01, "num_steps": 10, "project": True, "num_saves": 5, "solver": vm.Solver("masses")}
     runs = vm.ensemble(tsp, vm.fully_explicit(1), design, vary=own.put, save=save, **how, out=tmp_path / "tsp.zarr")
     data = runs.open()
     assert runs.failed_runs == 0

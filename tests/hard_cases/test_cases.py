@@ -9,8 +9,10 @@ import pytest
 import vmri_jax as vm
 from tests.hard_cases.broken_systems import no_potential, swapped_labels, wrong_gradient
 from tests.scene.gallery_scenes import SCENES, gallery_scene
+from tests.support import set_up
 from tests.user_systems import two_oscillators
 from vmri_jax import ConstantMass, Problem, Rheonomic, System
+from vmri_jax.accuracy.companions import resting
 from vmri_jax.hard_cases import cases, cases_for, run_cases
 from vmri_jax.hard_cases.cases import resolved
 
@@ -173,7 +175,7 @@ def test_a_run_that_blows_up_is_missed_not_raised():
 )
 def test_a_drift_goes_on_and_what_is_slow_does_not(monkeypatch, energy_at, passes):
     problem = two_oscillators()
-    start = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.01, num_steps=100)
+    start = resting(set_up(problem, vm.fully_implicit(1), 0.01, 100))
 
     def long_run(problem, scheme, macro_dt, num_steps):
         return dataclasses.replace(start, energy=1.0 + energy_at(np.linspace(0.0, num_steps, len(start))))

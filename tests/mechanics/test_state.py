@@ -62,30 +62,28 @@ def test_legendre_transform_of_a_kinetic_function():
 residual_of, projected = jax.jit(constraint_residual), jax.jit(project_momentum)
 
 
-@pytest.mark.parametrize("name", ["tsp", "sam"])
-def test_momenta_are_projected_onto_the_hidden_constraints(name, request):
-    problem = request.getfixturevalue(name)
+def test_momenta_are_projected_onto_the_hidden_constraints(tsp):
     rng = np.random.default_rng(1)
-    v_s, v_f = rng.normal(size=problem.q_s.shape), rng.normal(size=problem.q_f.shape)
-    state = initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f, project=True)
-    assert np.asarray(residual_of(problem.system, state))[1] < 1e-12  # measured 1.5e-13
-    raw = jax.device_get(jax.jit(legendre)(problem.system, problem.q_s, problem.q_f, v_s, v_f))
-    residual = np.asarray(residual_of(problem.system, State(np.zeros(()), problem.q_s, problem.q_f, *raw)))
+    v_s, v_f = rng.normal(size=tsp.q_s.shape), rng.normal(size=tsp.q_f.shape)
+    state = initial_state(tsp.system, tsp.q_s, tsp.q_f, v_s, v_f, project=True)
+    assert np.asarray(residual_of(tsp.system, state))[1] < 1e-12  # measured 1.5e-13
+    raw = jax.device_get(jax.jit(legendre)(tsp.system, tsp.q_s, tsp.q_f, v_s, v_f))
+    residual = np.asarray(residual_of(tsp.system, State(np.zeros(()), tsp.q_s, tsp.q_f, *raw)))
     assert residual[1] > 0.1
     # the correction is along the constraint normals: G^T mu
-    jacobians = jax.jit(lambda *q: jax.jacrev(problem.system.constraints, argnums=(1, 2))(0.0, *q))
-    jacobian = np.concatenate(jacobians(problem.q_s, problem.q_f), axis=1)
+    jacobians = jax.jit(lambda *q: jax.jacrev(tsp.system.constraints, argnums=(1, 2))(0.0, *q))
+    jacobian = np.concatenate(jacobians(tsp.q_s, tsp.q_f), axis=1)
     correction = np.concatenate([raw[0] - state.p_s, raw[1] - state.p_f])
     mu = np.linalg.lstsq(jacobian.T, correction, rcond=None)[0]
     assert np.abs(jacobian.T @ mu - correction).max() < 1e-12
     momenta = np.concatenate([state.p_s, state.p_f])
-    assert largest_difference(np.concatenate(projected(problem.system, state)[:2]), momenta) < 1e-12
+    assert largest_difference(np.concatenate(projected(tsp.system, state)[:2]), momenta) < 1e-12
 
     def kinetic(q_s, q_f, v_s, v_f, params):
-        return problem.system.kinetic(q_s, q_f, v_s, v_f, params)
+        return tsp.system.kinetic(q_s, q_f, v_s, v_f, params)
 
-    of_function = problem.system.replace(kinetic=kinetic)
-    of_raw = projected(of_function, State(np.zeros(()), problem.q_s, problem.q_f, *raw))
+    of_function = tsp.system.replace(kinetic=kinetic)
+    of_raw = projected(of_function, State(np.zeros(()), tsp.q_s, tsp.q_f, *raw))
     assert largest_difference(np.concatenate(of_raw[:2]), momenta) < 1e-11
 
 

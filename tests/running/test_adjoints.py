@@ -25,6 +25,13 @@ PENDULUM = vm.Problem(
     [],
     [0.0, 0.5],
 )
+SWING = vm.Problem(
+    vm.System(vm.ConstantMass([], [1.0]), fast_potential=lambda q_f, params: -params * jnp.cos(q_f[0]), params=9.81),
+    [],
+    [1.0],
+    [],
+    [0.5],
+)
 SIMPLE = {"kicks": vm.fully_explicit(2), "solved": vm.fully_implicit(1)}
 LONG = ("fpu", "tsp", "cart", "pendulum", "composed")
 """For --full: `test_parts` has steps that are solved, with and without constraints, in parts."""
@@ -55,8 +62,8 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save: vm.Save, solver=
 
 
 def simple_cost(steps="solved"):
-    """Of a small system without constraints, a function of the momenta at the start alone."""
-    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, vm.Save(6), vm.Solver("masses"))
+    """Of a single angle, a function of the momentum at the start alone."""
+    cost, at = cost_of(SWING, SIMPLE[steps], 0.05, 6, vm.Save(6), vm.Solver("masses"))
     return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
 
 

@@ -58,7 +58,9 @@ def test_lanes_fail_alone():
     problem, tilts = falling(0.0), np.array([0.0, 1e-3, 1e-9])
     states = jax.tree.map(lambda a: np.stack([a] * 3), problem.state())
     with pytest.warns(vm.FailedLanesWarning, match=r"2 of 3 lanes failed.*lane 1, at macro step 0 \(NOT_IMPLIED\)"):
-        run = vm.simulate_batch(problem.system, SCHEME, states, params={"tilt": tilts}, **STEPS)
+        run = vm.simulate_batch(
+            problem.system, SCHEME, states, params={"tilt": tilts}, solver=vm.Solver("masses"), **STEPS
+        )
     assert run.result.tolist() == [Result.CONVERGED, Result.NOT_IMPLIED, Result.NOT_IMPLIED]
     assert run.failed_at.tolist() == [-1, 0, 0]
 

@@ -60,10 +60,10 @@ def test_a_run_hands_back_what_was_computed(fpu, monkeypatch):
         return real(self, at, saves)
 
     arguments = {"macro_dt": 0.01, "num_steps": 100}
-    expected = simulate(fpu.system, fully_explicit(2), fpu.state(), **arguments)
+    expected = simulate(fpu.system, fully_explicit(3), fpu.state(), **arguments)
     monkeypatch.setattr(Simulation, "advance", advance)
     with pytest.raises(Interrupted, match=r"interrupted after 6 of 100 macro steps") as caught:
-        simulate(fpu.system, fully_explicit(2), fpu.state(), save=Save(progress=True), **arguments)
+        simulate(fpu.system, fully_explicit(3), fpu.state(), save=Save(progress=True), **arguments)
     found = caught.value.done
     assert found.success
     assert np.array_equal(found.q_f, expected.q_f[:7])

@@ -27,21 +27,21 @@ def moved(state: vm.State) -> vm.State:
 
 def test_it_runs_what_simulate_runs(fpu):
     steps: Any = STEPS | {"save": vm.Save(2, micro=True)}
-    run = vm.prepare(fpu.system, vm.explicit_slow(3), fpu.state(), **steps)
-    expected = vm.simulate(fpu.system, vm.explicit_slow(3), fpu.state(), **steps)
+    run = vm.prepare(fpu.system, vm.fully_explicit(3), fpu.state(), **steps)
+    expected = vm.simulate(fpu.system, vm.fully_explicit(3), fpu.state(), **steps)
     for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy", "t_micro", "q_f_micro"):
         assert np.array_equal(getattr(run(), name), getattr(expected, name)), name
 
 
 def test_numbers_change_without_compiling_again(fpu):
     system = fpu.system.replace(fast_potential=watched)
-    run = vm.prepare(system, vm.fully_implicit(3), fpu.state(), **STEPS)
+    run = vm.prepare(system, vm.fully_explicit(3), fpu.state(), **STEPS)
     params = {"omega": jnp.asarray(30.0)}
     CALLS.clear()
     changed = run(moved(fpu.state()), macro_dt=0.01, params=params, num_steps=20)
     assert Counter() == CALLS
     expected = vm.simulate(
-        system.replace(params=params), vm.fully_implicit(3), moved(fpu.state()), macro_dt=0.01, num_steps=20, save=5
+        system.replace(params=params), vm.fully_explicit(3), moved(fpu.state()), macro_dt=0.01, num_steps=20, save=5
     )
     assert Counter() == CALLS  # the same program
     assert largest_difference(changed.q_f, expected.q_f) == 0

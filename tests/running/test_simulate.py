@@ -232,13 +232,13 @@ def test_a_problem_or_a_scene_is_enough(given, fpu):
         system, state = moved.system(), moved.state()
     else:
         moved, system, state = fpu, fpu.system, fpu.state()
-    scheme, start = vm.fully_implicit(2), None
+    start = None
     if given == "system":
         moved, start = system, state
-    run = vm.simulate(moved, scheme, start, macro_dt=0.05, t_end=0.2)
-    expected = vm.simulate(system, vm.fully_implicit(2), state, macro_dt=0.05, num_steps=4)
+    run = vm.simulate(moved, SCHEME, start, macro_dt=0.05, t_end=0.2)
+    expected = vm.simulate(system, SCHEME, state, macro_dt=0.05, num_steps=4)
     assert np.array_equal(run.q_f, expected.q_f)
-    assert str(vm.plan(moved, scheme, start)) == str(vm.plan(system, scheme, state))
+    assert str(vm.plan(moved, SCHEME, start)) == str(vm.plan(system, SCHEME, state))
 
 
 def test_ends_of_runs(fpu):
@@ -288,13 +288,14 @@ def test_lengths_of_runs_share_a_program(fpu, request):
         np.testing.assert_array_equal(run.q_f, longest.q_f[: num_steps + 1])
 
 
-def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
-    """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the
-    end."""
-    whole = vm.simulate(fpu, vm.fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
+def test_pieces_of_a_run_make_the_whole(fpu, every_step, hits_the_wall, monkeypatch):
+    """Short pieces: the same nodes, to the last bit, with what steps remember of those before, and micro nodes; and
+    after a failure in one of them NaN to the end."""
+    whole, known = run(fpu, vm.fully_implicit(2), num_steps=36), failed(hits_the_wall, save=vm.Save(micro=True))
     monkeypatch.setattr("vmri_jax.running.simulation.NUMBERS_PER_PIECE", 100)
-    pieces = vm.simulate(fpu, vm.fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
-    jax.tree.map(np.testing.assert_array_equal, whole, pieces)
+    jax.tree.map(np.testing.assert_array_equal, whole, run(fpu, vm.fully_implicit(2), num_steps=36))
+    jax.tree.map(np.testing.assert_array_equal, every_step, run(fpu, save=vm.Save(micro=True)))
+    jax.tree.map(np.testing.assert_array_equal, known, failed(hits_the_wall, save=vm.Save(micro=True)))
 
     # each piece starts with the saved node at which the one before ends, momenta on the hidden constraints
     constrained = vm.prepare(cart(), vm.fully_explicit(1), macro_dt=0.02, num_steps=8, save=2)
@@ -303,14 +304,6 @@ def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
     for column in ("p_f", "table"):
         np.testing.assert_array_equal(getattr(second.nodes, column)[0], getattr(first.nodes, column)[-1])
     assert second.nodes.table[:, 2].max() < 1e-11
-
-    steep = fpu.system.replace(fast_potential=lambda q_f, params: jnp.log(1.2 - q_f[0]) - 1e2 * q_f[0])
-    failed = until_failure(steep, vm.fully_explicit(1), fpu.state(), macro_dt=0.01, num_steps=60)
-    assert 5 < failed.failed_at < 55
-    known = np.isfinite(np.asarray(failed.energy))
-    assert known[: int(failed.failed_at)].all()
-    assert not known[int(failed.failed_at) + 1 :].any()
-    np.testing.assert_allclose(failed.t, 0.01 * np.arange(61), rtol=1e-15)
 
 
 def test_a_single_step_ends_as_a_run_does():

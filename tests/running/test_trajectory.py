@@ -4,12 +4,10 @@ import errno
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.support import joined
 
 SCHEME = vm.fully_explicit(3)
 FIELDS = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
@@ -89,14 +87,6 @@ def test_xarray_dataset(trajectory):
     assert data["iterations"].values.tolist() == [-1, *trajectory.info.iterations.tolist()]
     assert float(data["q_s"].sel(t=0.12, method="nearest")[1]) == float(trajectory.q_s[2, 1])
     assert data.attrs == {"result": "CONVERGED", "failed_at": -1}
-
-
-@pytest.mark.parametrize("at", [0, 1])
-def test_the_status_of_all_pieces(trajectory, at):
-    pieces = [trajectory, trajectory]
-    roundoff = np.asarray(int(vm.Result.CONVERGED_AT_ROUNDOFF))
-    pieces[at] = eqx.tree_at(lambda piece: piece.result, trajectory, roundoff)
-    assert int(joined(pieces).result) == vm.Result.CONVERGED_AT_ROUNDOFF
 
 
 def test_a_run_refuses_a_system_with_other_parameters(tmp_path):

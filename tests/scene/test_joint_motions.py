@@ -1,4 +1,4 @@
-"""Motions in joint coordinates: orders of schemes, energy over many steps, gradients and fits of a scene's numbers."""
+"""Motions in joint coordinates: orders of schemes, energy over many steps, gradients of a scene's numbers."""
 
 from typing import Any
 
@@ -92,20 +92,3 @@ def test_gradients_through_length_mass_and_stiffness():
         low, high = (seen(numbers.at[i].add(sign * step)) for sign in (-1, 1))
         assert slopes[:, i] == pytest.approx(np.asarray(high - low) / (2 * step), rel=1e-6, abs=2e-8)
         assert np.abs(slopes[:, i]).max() > 1e-2
-
-
-def angle(state):
-    return state.q_s
-
-
-@pytest.mark.full  # the search compiles for half a minute; tests of fits show how it ends elsewhere
-def test_a_fit_of_stiffness_and_damping_from_angles():
-    scheme, true = vm.fully_implicit(1), {"stiffness": 3.0, "damping": 0.15}
-    run = vm.simulate(swing(true), scheme, macro_dt=0.02, num_steps=40)
-    noise = 1e-4 * np.random.default_rng(0).standard_normal((41, 1))
-    data = vm.fitting.Measured(run.t, run.position("hinge") + noise, sigma=1e-4, observe=angle)
-    first = {"stiffness": vm.fitting.Unknown(2.0, lower=0), "damping": vm.fitting.Unknown(0.4, lower=0)}
-    fit = vm.fit(swing, data, first, scheme=scheme, macro_dt=0.02)
-    for name, value in true.items():
-        assert abs(fit.parameters[name] - value) < 3 * fit.standard_errors[name]
-        assert fit.standard_errors[name] < 0.01 * value

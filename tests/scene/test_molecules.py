@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import vmri_jax as vm
 from vmri_jax import scene as sc
 from vmri_jax.mechanics.invariants import potential_energy
 
@@ -109,21 +108,3 @@ def test_custom_functions_are_tried_when_the_scene_is_made():
         sc.Scene(BODIES, [sc.Potential(numpy_potential, "a", {"k": 2.0})])
     with pytest.raises(ValueError, match=r"pull: bodies is .*for several tuples of bodies write"):
         sc.Scene(BODIES, [sc.Potential(numpy_potential, [("a", "b"), ("c", "d")], name="pull")])
-
-
-def test_a_run_that_loses_its_energy_is_told_about():
-    scene = sc.Scene(
-        [sc.Body("slow", 100.0, 0.0, pace="slow"), sc.Body("fast", 1.0, 1.2, pace="fast")],
-        [sc.Spring(("slow", "fast"), 100.0, 1.0)],
-    )
-    run = vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.05, num_steps=200)
-    assert run.success
-    with pytest.warns(vm.LostEnergyWarning, match=r"the energy, which the system keeps"):
-        vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.201, num_steps=200)
-
-
-def test_ledgers_and_tables_print():
-    printed = str(molecule(rate="slow").explain(vm.fully_explicit(5), measure=False))
-    assert "torsion" in printed
-    assert "slow potential V" in printed
-    assert len(printed.splitlines()) == 9

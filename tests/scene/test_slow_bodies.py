@@ -53,12 +53,11 @@ def operations_of_an_interval(march: MarchEquations) -> float:
 
 def test_a_micro_interval_does_not_cost_more_with_more_slow_bodies():
     costs = {}
-    for wheels in (0, 2, 6):
+    for wheels in (0, 6):
         march, state = march_of(satellite(wheels))
         assert (state.q_s.size, march.n_v) == (12 + wheels, 12)
         costs[wheels] = operations_of_an_interval(march)
     assert costs[0] > 500
-    assert costs[2] == costs[6]
     assert costs[6] < 1.05 * costs[0]  # what is seen is taken from more: measured 1.00
 
 

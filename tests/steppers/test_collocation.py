@@ -115,7 +115,6 @@ COMPOSED = vm.compose(vm.galerkin(1, 2, "lobatto"), [0.5, -0.3, 0.8])
 @pytest.mark.parametrize(
     ("name", "scheme", "macro_dt", "passes"),
     [
-        ("tsp", vm.galerkin(1, 3), 0.02, 9),
         pytest.param("sam", vm.galerkin(1, 2), 0.01, 9, marks=pytest.mark.full),
         ("general", vm.galerkin(1, 3), 0.1, 15),
         pytest.param("general", COMPOSED, 0.1, 15, marks=pytest.mark.full),

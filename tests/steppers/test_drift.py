@@ -62,7 +62,6 @@ def test_a_composition_solves_the_equations_of_its_stages():
     ("name", "scheme", "matrix"),
     [
         ("tsp", vm.compose(vm.fully_explicit(1), [1.0, -1.0, 1.0]), "masses"),
-        ("general", vm.fully_explicit(1), "masses"),
         pytest.param("tsp", vm.fully_implicit(2), "masses", marks=pytest.mark.full),  # `test_custom` has such a step
         ("tsp", vm.fully_implicit(2), "exact"),
     ],

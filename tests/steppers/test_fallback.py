@@ -46,16 +46,14 @@ def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
 
 def test_auto_falls_back_where_the_march_does_not_converge():
     """At H = 2 the curvature of V outweighs the mass of the slow variables."""
-    problem, solver = two_oscillators(kappa=25.0), Solver(max_iterations=6)
+    problem, solver, exactly = two_oscillators(kappa=25.0), *(Solver(m, max_iterations=6) for m in ("auto", "exact"))
 
     def go(state, solver):
         step = {"macro_dt": 40.0, "num_steps": 3, "solver": solver}
         return until_failure(problem.system, vm.fully_implicit(20), state, **step)
 
     state = problem.state()
-    march, run, exact = (go(state, n) for n in (Solver("masses", max_iterations=6), solver, Solver("exact")))
-    assert int(march.result) == vm.Result.STAGNATED
-    assert int(march.failed_at) == 0
+    run, exact = go(state, solver), go(state, exactly)
     assert run.success
     assert np.all(run.info.method == vm.Method.EXACT)
     for name in ("q_s", "q_f", "p_s", "p_f"):

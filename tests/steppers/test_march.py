@@ -29,7 +29,6 @@ def positions(run):
     [
         ("fpu", vm.galerkin(4, 2), 0.1, 6),  # measured 5.1
         ("fpu", vm.explicit_slow(4), 0.04, 2),
-        ("tsp", vm.galerkin(2, 3), 0.006, 5.5),  # measured 4.8
         ("tsp", vm.fully_explicit(10), 0.02, 4.2),
         ("pendulum", vm.explicit_slow(5), 0.01, 6.5),  # measured 5.9
         pytest.param("sam", vm.explicit_slow(5), 0.01, 5.5, marks=pytest.mark.full),  # measured 5.0
@@ -121,15 +120,13 @@ def test_macro_steps_in_which_slow_forces_turn_over():
     assert run.info.iterations.max() < 16  # measured 10
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-def test_forces_on_slow_variables_cost_few_passes(degree):
-    """Potential and damping: by the masses alone it would be 77 and 31."""
+def test_forces_on_slow_variables_cost_few_passes():
+    """Potential and damping: by the masses alone it would be 77."""
     problem = two_oscillators()
     system = problem.system.replace(force=lambda t, q_s, q_f, v_s, v_f, params: (-5.0 * v_s, 0.0 * v_f))
-    run = vm.simulate(
-        system, vm.galerkin(20, degree), problem.state(), macro_dt=0.2, num_steps=20, solver=Solver("masses")
-    )
-    assert run.info.iterations.mean() < 7.5  # measured 6.3 and 6.4
+    how = {"macro_dt": 0.2, "num_steps": 20, "solver": Solver("masses")}
+    run = vm.simulate(system, vm.fully_implicit(20), problem.state(), **how)
+    assert run.info.iterations.mean() < 7.5  # measured 6.3
 
 
 def test_equal_masses_converge():

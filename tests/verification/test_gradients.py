@@ -1,5 +1,8 @@
 # pyright: reportCallIssue=false
-"""Derivatives of a final position, by the implicit function theorem at each step, against central differences."""
+"""Derivatives of a final position, by the implicit function theorem at each step, against central differences.
+
+`tests/running/test_parts.py` has them with the exact solve behind the steps in the program.
+"""
 
 from functools import cache, partial
 
@@ -21,8 +24,6 @@ CASES = {  # problem, scheme, macro_dt, name and entry of the parameter
     "tsp, fully implicit": (PROBLEMS["tsp"](), vm.fully_implicit(3), 0.02, "stiffness", None),
     "sam, fully implicit": (PROBLEMS["sam"](), vm.fully_implicit(2), 0.02, "stiffness", 2),
 }
-FALLS_BACK = "chain, gauss 2"
-"""The case with the fallback in its program."""
 LONG = ("chain, fully implicit", "fpu, fully implicit", "tsp, fully implicit", "sam, fully implicit")
 
 
@@ -39,7 +40,7 @@ def gradient_program(case: str):
     projected onto the constraints, and the fast positions q_f."""
     problem, scheme, macro_dt, parameter, entry = CASES[case]
     params, n_s = problem.system.params, problem.q_s.size
-    solver = vm.Solver() if case == FALLS_BACK else without_fallback(problem, scheme)
+    solver = without_fallback(problem, scheme)
 
     def replaced(stiffness):
         if parameter is None:
@@ -89,7 +90,7 @@ def test_gradient_with_respect_to_the_start_and_the_step():
     expected = [central_difference(value_by_argument(case, 1, i), at[1][i], 1e-2) for i in range(3)]
     assert np.abs(expected).max() > 0.01
     assert np.allclose(program(*at)[1][1], expected, rtol=1e-6, atol=1e-9)
-    case = FALLS_BACK
+    case = "chain, gauss 2"
     program, at = gradient_program(case)
     _, _, by_position, by_step = program(*at)[1]
     expected = [central_difference(value_by_argument(case, 2, i), at[2][i], 1e-3) for i in range(at[2].size)]

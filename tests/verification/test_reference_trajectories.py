@@ -21,22 +21,17 @@ def scheme_of(case):
 
 
 RUNS = [(name, method) for name in sorted(CASES) for method in ("auto", "dense", "masses", "exact")]
-DENSE = ("sam_explicit_slow_a05_p4",)
-"""Case that the dense method solves also without --full, with constraints of both kinds; `tests/textbook` and
-`tests/steppers/test_march.py` have it on other systems."""
-OFTEN = ("fpu_fully_explicit_a025_p5", "tsp_fully_implicit_a05_p5", "tsp_explicit_slow_a10_p5", *DENSE)
-"""Cases that are solved without --full: each system and each scheme.
+SAM = "sam_explicit_slow_a05_p4"
+OFTEN = ("fpu_fully_explicit_a025_p5", "tsp_fully_implicit_a05_p5", "tsp_explicit_slow_a10_p5", SAM)
+"""Cases that are solved without --full, with the method of choice: each system and each scheme.
 
-`tests/textbook` has all other pairs on systems of its own.
+`tests/textbook` has all other pairs on systems of its own; it and `tests/steppers/test_march.py` have the dense method.
 """
 
 
-def is_long(name, method) -> bool:
-    return name not in {"auto": OFTEN, "dense": DENSE}.get(method, ())
-
-
 @pytest.mark.parametrize(
-    ("name", "method"), [pytest.param(*run, marks=pytest.mark.full if is_long(*run) else ()) for run in RUNS]
+    ("name", "method"),
+    [pytest.param(*run, marks=() if run[0] in OFTEN and run[1] == "auto" else pytest.mark.full) for run in RUNS],
 )
 def test_trajectory_equals_the_reference(name, method):
     case = CASES[name]
