@@ -88,6 +88,6 @@ def test_reaction_forces_of_a_slider_crank():
     for joint, name, mine in (("crank pin", "rod", forces[2:4]), ("cylinder", "piston", [0.0, forces[6]])):
         rows = twin.names.rows
         chosen = np.isin(np.arange(sum(map(len, rows.values()))), rows[joint])
-        (theirs,), _ = forces_of(twin.system(), state, chosen[None])
+        (theirs,), _ = forces_of(twin.system(), (state, chosen[None]))
         start = twin.places[name].start
         np.testing.assert_allclose(theirs[start : start + 2], mine, atol=1e-8)  # N, values of 10 to 100
