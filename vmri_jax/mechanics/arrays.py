@@ -88,7 +88,7 @@ def split_at(vector, *ends):
     """The parts of a joined vector, between the indices `ends` along its last axis: ``q_s, q_f = split_at(q, n_s)``.
 
     Empty parts are constants: XLA compiles wrong programs, or ends the process, where a program takes an empty slice of
-    a concatenation (JAX 0.10.2, above all on a single core).
+    a concatenation (JAX 0.10.0 to 0.12.0, above all on a single core).
     """
     bounds = [0, *ends, vector.shape[-1]]
     empty = np.zeros((*vector.shape[:-1], 0), vector.dtype)
