@@ -55,7 +55,8 @@ def single(way: str, lane: int):
 
 
 LONG = ("collocation", "composition", "kicks")
-"""For --full: what a step of one lane decides for itself, the nested iteration has, too; kicks are below."""
+"""Ways for --full alone: the nested iteration also has decisions that each lane takes for itself, and lanes of kicks
+have a test below."""
 
 
 @pytest.mark.parametrize("way", [pytest.param(way, marks=pytest.mark.full if way in LONG else ()) for way in WAYS])

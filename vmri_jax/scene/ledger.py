@@ -199,17 +199,16 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
     (n,)."""
 
     def lagrangian(q):
-        potentials = invariants.potential_energy(system, *split_at(q, n_s))
-        if system.has_constant_mass:
-            return -potentials
-        return system.kinetic_energy(*split_at(q, n_s), v_s, v_f) - potentials
+        q_s, q_f = split_at(q, n_s)
+        potentials = invariants.potential_energy(system, q_s, q_f)
+        return -potentials if system.has_constant_mass else system.kinetic_energy(q_s, q_f, v_s, v_f) - potentials
 
     def derivatives(q):
-        total = jax.grad(lagrangian)(q)
+        (q_s, q_f), total = split_at(q, n_s), jax.grad(lagrangian)(q)
         if system.is_constrained:
             total += jax.jacrev(lambda q: system.constraints(0.0, *split_at(q, n_s)))(q).sum(axis=0)
         if system.force is not None:
-            total += jnp.concatenate(system.forces(0.0, *split_at(q, n_s), v_s, v_f))
+            total += jnp.concatenate(system.forces(0.0, q_s, q_f, v_s, v_f))
         return total
 
     return derivatives
