@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 import vmri_jax as vm
 from vmri_jax.control.transcription import Transcription
@@ -173,8 +174,13 @@ def restored():
 
 
 def slope(function):
-    """The stiffness of an energy: its second derivative, by a program that JAX keeps for equal systems."""
-    return float(second_derivative(vm.System(vm.ConstantMass([1.0], []), function)))
+    """The stiffness of an energy: its second derivative, by a program that JAX keeps for equal systems.
+
+    The program is traced, which asks for one that is kept as a call does, and not compiled.
+    """
+    system = vm.System(vm.ConstantMass([1.0], []), function)
+    (stiffness,) = jaxpr_as_fun(second_derivative.trace(system).jaxpr)(*jax.tree.leaves(system))
+    return float(stiffness)
 
 
 @jax.jit
