@@ -120,7 +120,7 @@ class Solved(Stepper):
 
     def advance(self, state: State, memory: SolvedMemory, macro_dt) -> tuple[State, StepInfo, SolvedMemory]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt, memory.last_dt)
-        # no derivative enters the iteration; `derivative` attaches the one of the root
+        # no derivative enters the iteration; `differentiable` attaches the derivative of the root
         solution, solver = self._solve(*jax.lax.stop_gradient((equations, memory)))
         root, status = checkpoint_name(((solution.x, solution.end), solution.status), ROOT)
         x, (q_f, p_s, p_f) = differentiable(equations, *root)
