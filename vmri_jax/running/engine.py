@@ -212,7 +212,7 @@ def _interval(stepper: Plan, run, repeat: Callable):
         alive = cursor.failed_at < 0
         state, info, memory = stepper.step(cursor.state, cursor.memory, macro_dt)
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
-        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info.status)
+        worst = jax.tree.map(partial(jnp.where, alive), worst.worse(info.status), worst)
         # NaN in the momenta alone: the next step carries it into all positions.
         p_s, p_f = (jnp.where(ok, p, jnp.nan) for p in (state.p_s, state.p_f))
         # t_k = t_0 + k H from the step number, since a sum of steps would accumulate round-off; the time of the stepper

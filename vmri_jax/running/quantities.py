@@ -76,7 +76,7 @@ class Quantities:
         """Names of bodies, coordinates and constraints, plain ones where none are known."""
         n_s, n_f = self.states.q_s.shape[-1], self.states.q_f.shape[-1]
         names = self.origin.names or Names()
-        if not self.origin.knows_system:
+        if self.origin.simulated is None:
             return names.of_coordinates(n_s, n_f)
         return names.of(self.origin.system(np.ndim(self.energy) - 1), n_s, n_f)
 

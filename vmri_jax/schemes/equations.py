@@ -29,7 +29,6 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Number, Numbers
-from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
@@ -91,7 +90,7 @@ class StepEquations(eqx.Module):
 
     def mass_diagonal(self):
         """Diagonals (n_s,) and (n_f,) of the constant masses, or of `masses`."""
-        if isinstance(self.system.kinetic, ConstantMass):
+        if self.system.has_constant_mass:
             return self.system.kinetic.diagonal
         assert self.masses is not None
         return tuple(jnp.split(jnp.diagonal(self.masses), [self.q_s.size]))

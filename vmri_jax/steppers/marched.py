@@ -78,7 +78,7 @@ class Marched(StepSolver):
     """
 
     settings: Solver
-    sizes: tuple[int, int, int, int, int] | None = None
+    sizes: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
 
     def init(self, equations: StepEquations) -> MarchMemory:
         march = self._march(equations, NO_WEIGHTS)
@@ -238,8 +238,6 @@ class Marched(StepSolver):
         if self._has_multipliers:
             return ["exact: micro intervals in order with exact matrices"]
         head = "null_space: micro intervals in order with exact matrices, without multipliers"
-        if self.sizes is None:
-            return [head]
         *counts, r = self.sizes
         parts = zip(("slow variables", "each micro interval"), counts[::2], counts[1::2], strict=True)
         unknowns = [f"  unknowns of {part}: {r * (n - g)}, with multipliers {r * (n + g)}" for part, n, g in parts if g]

@@ -12,7 +12,7 @@ from vmri_jax.kernels.band import BandInverse, FullInverse
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import IntervalStructure, Matrix, constant_mass
+from vmri_jax.steppers.interval import IntervalStructure, Matrix
 from vmri_jax.steppers.solver import only_if
 
 
@@ -67,7 +67,7 @@ class MicroSweep(NamedTuple):
             increment.
         """
         equations, r = self.intervals.equations, self.intervals.equations.scheme.degree
-        velocity = constant_mass(equations.system).fast_mass.inverse().times
+        velocity = equations.system.kinetic.fast_mass.inverse().times
         seen = self.intervals.seen.take(slow)
 
         def interval(carry, numbers):

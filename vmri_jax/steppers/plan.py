@@ -46,7 +46,7 @@ from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Solved, StepSolver
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
-from vmri_jax.steppers.subsystems import fast_part, frozen_slow, joined, slow_part
+from vmri_jax.steppers.subsystems import frozen_slow, joined, part_alone
 
 Parts = tuple[list[PlacedTerm], dict[int, list[PlacedTerm]]]
 """Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals
@@ -302,8 +302,8 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
 
 def _decoupled(system: System, scheme: Scheme, solver: Solver, q_s, q_f, potentials: Parts) -> Decoupled:
     (of_slow, of_fast), none = potentials, jnp.zeros(0)
-    slow, slow_scheme = slow_part(system, of_slow, num_fast=q_f.size)
-    parts = {every: fast_part(system, further, num_slow=q_s.size) for every, further in of_fast.items()}
+    slow, slow_scheme = part_alone(system, "slow", of_slow, num_other=q_f.size)
+    parts = {every: part_alone(system, "fast", further, num_other=q_s.size) for every, further in of_fast.items()}
     fast, length = _whole_step(*parts.pop(1), solver, none, q_f), 1
     for every, part in parts.items():
         fast = Kicked(lagrangian(*part).kicks, Repeated(fast, every // length))
