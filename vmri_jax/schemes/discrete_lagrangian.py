@@ -26,7 +26,7 @@ from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.path import Nodes, lagrange_derivative, position_nodes, slow_velocity_nodes, velocity_nodes
+from vmri_jax.schemes.path import Nodes, lagrange_derivative, position_nodes, velocity_nodes
 from vmri_jax.schemes.quadrature import PlacedRule
 from vmri_jax.schemes.scheme import Scheme
 
@@ -189,7 +189,7 @@ def _kinetic_functions(system, scheme, nodes: Nodes) -> list[TermOnNodes]:
     both, slow = system.kinetic, system.slow_kinetic
     terms = [TermOnNodes(lambda *z: both(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes)]
     if slow is not None:
-        nodes = slow_velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
+        nodes = velocity_nodes(scheme.kinetic, 1, scheme.degree)  # the macro interval as one micro interval
         terms.append(TermOnNodes(lambda *z: slow(*z, system.params), ("q_s", "v_s"), nodes, grid="macro"))
     return terms
 

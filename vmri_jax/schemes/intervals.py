@@ -80,9 +80,9 @@ class Intervals:
         self.equations = equations
         of_step = lagrangian(equations.system, equations.scheme)
         self.kinetic, inner = of_step.kinetic, [term for term in of_step.terms if len(term.inside.c)]
-        of_slow = [all(name.endswith("_s") for name in term.arguments) for term in inner]
-        self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
-        of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
+        sees_fast = {"q_f", "v_f"}.intersection
+        self._slow_terms = [term for term in inner if not sees_fast(term.arguments)]
+        of_fast = (term for term in inner if sees_fast(term.arguments))
         self.terms = [(term, nodes) for term in of_fast for nodes in IntervalNodes.of(term.inside)]
         n, r, has_force = equations.scheme.num_micro, equations.scheme.degree, equations.system.force is not None
         self._force_nodes = IntervalNodes.of(velocity_nodes(equations.scheme.force, n, r)) if has_force else []

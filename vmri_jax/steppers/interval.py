@@ -86,15 +86,15 @@ class IntervalStructure:
         sum over the coordinates. K then leaves out forces and potentials that depend on slow variables: this costs
         passes, not accuracy.
     is_constant: whether K is the same for a whole run.
-    curved: sparsity of K, where it is not diagonal.
-    sparsity: of ``G K^-1 G^T``.
+    of_matrix: sparsity of K, where it is not diagonal.
+    of_constraints: sparsity of ``G K^-1 G^T``.
     """
 
     is_explicit: bool
     is_diagonal: bool
     is_constant: bool
-    curved: Sparsity
-    sparsity: Sparsity
+    of_matrix: Sparsity
+    of_constraints: Sparsity
 
     @classmethod
     def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "IntervalStructure":
@@ -112,17 +112,17 @@ class IntervalStructure:
         is_constant = (is_diagonal or not varies) and all(
             has_constant_hessian(term.at, q_s, q_f) for term in (of_fast if is_diagonal else terms)
         )
-        full = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
-        sparsity = fast_rows(system, q_s, q_f, scheme.degree) if is_diagonal else full
-        curved = Full(scheme.degree * q_f.size)
+        of_matrix = Full(scheme.degree * q_f.size)
         if not is_diagonal and q_f.size > MOST_ROWS_OF_FULL_MATRIX:
-            curved = _curved(system, scheme, q_s.size, q_f.size)
-        return cls(is_explicit, is_diagonal, is_constant, curved, sparsity)
+            of_matrix = _of_matrix(system, scheme, q_s.size, q_f.size)
+        full = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
+        of_constraints = fast_rows(system, q_s, q_f, scheme.degree) if is_diagonal else full
+        return cls(is_explicit, is_diagonal, is_constant, of_matrix, of_constraints)
 
     @property
     def is_cheap(self) -> bool:
         """Whether every macro step computes K anew: it is small, or no larger than a few vectors."""
-        return self.is_diagonal or isinstance(self.curved, Band) or self.curved.size <= LARGEST_RENEWED
+        return self.is_diagonal or isinstance(self.of_matrix, Band) or self.of_matrix.size <= LARGEST_RENEWED
 
     def no_matrix(self, equations: StepEquations) -> Matrix:
         """K filled with zeros, for its shapes."""
@@ -139,9 +139,9 @@ class IntervalStructure:
         if self.is_diagonal:
             return _diagonal_matrix(intervals, path)
         times_k = jax.linearize(partial(_rows, intervals, path), fast)[1]
-        seeds = self.curved.seeds
+        seeds = self.of_matrix.seeds
         products = jax.vmap(times_k)(seeds.reshape(len(seeds), *fast.shape))
-        return JoinedMatrix(self.curved.inverse(products.reshape(seeds.shape), may_depend=False))
+        return JoinedMatrix(self.of_matrix.inverse(products.reshape(seeds.shape), may_depend=False))
 
 
 def _rows(intervals: Intervals, path: IntervalPath, fast):
@@ -151,7 +151,7 @@ def _rows(intervals: Intervals, path: IntervalPath, fast):
     return intervals.rows(intervals.with_inertia(d, fast))
 
 
-def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
+def _of_matrix(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
     """Sparsity of K: the rows that change with each fast coordinate on random paths.
 
     An entry that differs from zero elsewhere alone is missed, which costs passes, not accuracy.

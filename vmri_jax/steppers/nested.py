@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import LINEARISES_FORCES, max_abs
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
@@ -184,8 +185,10 @@ class _Passes:
         hidden constraints, from straight motion."""
         increment = self.equations.macro_dt * self.mass.slow_mass.inverse().times(self.equations.p_s)
         straight = (control_nodes(self.r)[1:, None] * increment).reshape(-1)
-        slow = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
-        z, fast, zero = self._apart(slow), self.sweep.unsolved(), jnp.zeros(())
+        predicted = self.memory.slow.next(straight.size, jnp.pad(straight, (0, self.r * self.num_multipliers)))
+        slow, multiplier = split_at(predicted, straight.size)
+        z = slow.reshape(self.r, self.n_s), multiplier.reshape(self.r, self.num_multipliers)
+        fast, zero = self.sweep.blank(), jnp.zeros(())
         inertia = ConstraintInertia(*2 * [jnp.zeros((self.memory.multiplier.size, self.r, self.n_s))])  # none yet
         none, error = jnp.zeros(self.r * self.n_s), self.memory.slow_model_error
         numbers = zero, jnp.asarray(0), jnp.asarray(RUNNING)
@@ -242,8 +245,3 @@ class _Passes:
             passes=passes,
             result=self.settings.status(ratio, passes),
         )
-
-    def _apart(self, z):
-        """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""
-        size = self.r * self.n_s
-        return z[:size].reshape(self.r, self.n_s), z[size:].reshape(self.r, -1)

@@ -35,7 +35,7 @@ from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
-from vmri_jax.steppers.custom import check_shapes, whole_step
+from vmri_jax.steppers.custom import check_shapes, with_kicks
 from vmri_jax.steppers.decoupled import Decoupled, Joined
 from vmri_jax.steppers.direct import FreeFlight, Linear
 from vmri_jax.steppers.interval import SMALL, IntervalStructure, implicit_terms
@@ -133,7 +133,7 @@ def plan(
     if solver.stepper is None or isinstance(custom, StepSolver):
         stepper: Stepper = _whole_step(system, stage, solver, state.q_s, state.q_f)
     else:
-        stepper = whole_step(custom, system, stage, _average(system, stage, Solver()))
+        stepper = with_kicks(custom, system, stage, _average(system, stage, Solver()))
     if solver.stepper is not None:
         check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):

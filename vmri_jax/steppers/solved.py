@@ -145,7 +145,7 @@ class Solved(Stepper):
             _, _, v_s, v_f, masses = project_momentum(system, state, sparsity=self.sparsity)
         else:
             velocities, masses = velocity_and_masses(system, *phase)
-            is_first = equations.before == 0
+            is_first = equations.last_dt == 0
             v_s, v_f = jax.tree.map(partial(jnp.where, is_first), velocities, memory.velocity)
         guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
