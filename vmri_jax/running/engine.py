@@ -238,18 +238,17 @@ def unsolved(result, method):
     return (result > Result.CONVERGED_AT_ROUNDOFF) & (result != Result.NOT_IMPLIED) & (method > Method.LINEAR)
 
 
-def solved_again(first: Callable, exact: Callable, failed: Callable, arguments: Any) -> Any:
-    """``first(arguments)``, or ``exact(arguments)`` where that has failed, in one program, to be transformed.
+def solved_again(first: Callable, exact: Callable, status: Callable, arguments: Any) -> Any:
+    """``first(arguments)``, or ``exact(arguments)`` where that is `unsolved`, in one program, to be transformed.
 
     The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs.
-    Values of the two differ by the tolerance of the solver. ``failed(value)`` says whether a value of `first` is
-    computed again.
+    Values of the two differ by the tolerance of the solver. ``status(value)`` is (result, method) of a value.
     """
 
     @jax.custom_jvp
     def run(arguments):
         value = first(arguments)
-        return jax.lax.cond(failed(value), lambda: exact(arguments), lambda: value)
+        return jax.lax.cond(unsolved(*status(value)), lambda: exact(arguments), lambda: value)
 
     run.defjvp(lambda primals, tangents: jax.jvp(exact, primals, tangents))
     return run(arguments)

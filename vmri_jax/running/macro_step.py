@@ -10,7 +10,7 @@ from vmri_jax.mechanics.checks import check_system, check_type
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import check_run
-from vmri_jax.running.engine import solved_again, unsolved
+from vmri_jax.running.engine import solved_again
 from vmri_jax.running.observables import Observables, fault, is_right, observed
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import plan
@@ -56,7 +56,7 @@ def _macro_step(arguments):
     if not plan(system, scheme, state, solver).has_fallback:
         return _step(arguments)
     exact = partial(_step, exact=True)
-    return solved_again(_step, exact, lambda end: unsolved(end[1].result, end[1].method), arguments)
+    return solved_again(_step, exact, lambda end: end[1].status[:2], arguments)
 
 
 def _step(arguments, exact: bool = False):

@@ -178,12 +178,9 @@ class Simulation:
         def steps(run: Simulation) -> Callable[[list], Saved]:
             return lambda leaves: run.engine.differentiable(leaves, run.save_every)
 
-        def failed(saved: Saved):
-            return unsolved(saved.result, saved.method)
-
         run = steps(self)
         if self.plan.has_fallback:
-            run = partial(solved_again, run, steps(self.exact), failed)
+            run = partial(solved_again, run, steps(self.exact), lambda saved: (saved.result, saved.method))
         saved = run(self.leaves)
         return self.engine.nodes_as_saved(self.leaves, saved, self.save_every).trajectory(self)
 

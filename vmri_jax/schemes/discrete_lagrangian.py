@@ -17,14 +17,14 @@ rule, of the order of the scheme. The cost of the left sum does not grow with th
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.system import ConstantMass, System
-from vmri_jax.mechanics.terms import Term
+from vmri_jax.mechanics.terms import POSITIONS, Term
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.path import Nodes, lagrange_derivative, position_nodes, velocity_nodes
 from vmri_jax.schemes.quadrature import PlacedRule
@@ -62,13 +62,15 @@ class TermOnNodes:
         return macro_dt ** (1 + self.power)
 
     def at(self, q_s, q_f):
-        """The signed integrand at one configuration, of a term without velocities."""
-        q = {"q_s": q_s, "q_f": q_f}
-        return self.sign * self.integrand(*(q[name] for name in self.arguments))
+        """The integrand at one configuration, of a term without velocities."""
+        q = dict(zip(POSITIONS, (q_s, q_f), strict=True))
+        return self.integrand(*(q[name] for name in self.arguments))
 
     def gradient(self, q_s, q_f):
         """``(d/dq_s, d/dq_f)`` of the signed integrand at one configuration, for kicks."""
-        return jax.grad(self.at, argnums=(0, 1))(q_s, q_f)
+        by_position = zip(POSITIONS, jax.grad(self.at, argnums=(0, 1))(q_s, q_f), strict=True)
+        # the derivative by an argument that the term does not have stays 0: XLA would add a -0
+        return tuple(self.sign * d if name in self.arguments else d for name, d in by_position)
 
 
 @dataclass(frozen=True)
@@ -161,8 +163,7 @@ def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
         return []
     if not system.has_constant_mass:
         raise Refused("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
-    mass, potentials = system.kinetic, (system.slow_potential, system.fast_potential)
-    slow_potential, fast_potential = cast(tuple[Callable, Callable], potentials)
+    mass, slow_potential, fast_potential = system.kinetic, system.slow_potential, system.fast_potential
     both = scheme.fast.gradient_corrected and fast_potential is not None
 
     def fast(q_f, params):

@@ -83,7 +83,7 @@ class IntervalEquations:
 
     def potential(self, q):
         """All potentials at one point."""
-        return -sum((term.at(self.q_s, q) for term in self.potentials), jnp.zeros(()))
+        return -sum((term.sign * term.at(self.q_s, q) for term in self.potentials), jnp.zeros(()))
 
     def potential_of_fast(self, q, fast):
         """`potential` with the fast variables as an argument of their own."""
@@ -114,7 +114,7 @@ class IntervalEquations:
         for term in self.potentials:
             theta = term.inside.theta
             basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
-            gradient = jax.grad(partial(term.at, self.q_s))
+            gradient = jax.grad(lambda q, term=term: term.sign * term.at(self.q_s, q))
             before, k = int(np.argmax(basis[0, 1:])), len(theta)
             consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
             if np.array_equal(basis, consecutive):  # quadrature nodes are control nodes: no interpolation

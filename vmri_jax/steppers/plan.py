@@ -308,7 +308,7 @@ def _decoupled(system: System, scheme: Scheme, solver: Solver, q_s, q_f, potenti
     for every, part in parts.items():
         fast = Kicked(lagrangian(*part).kicks, Repeated(fast, every // length))
         length = every
-    return Decoupled(_whole_step(slow, slow_scheme, solver, none, q_s), fast, scheme.num_micro // length)
+    return Decoupled(_whole_step(slow, slow_scheme, solver, none, q_s), Repeated(fast, scheme.num_micro // length))
 
 
 def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Composition:
