@@ -17,7 +17,7 @@ rule, of the order of the scheme. The cost of the left sum does not grow with th
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -163,7 +163,8 @@ def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
         return []
     if not system.has_constant_mass:
         raise Refused("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
-    mass, slow_potential, fast_potential = system.kinetic, system.slow_potential, system.fast_potential
+    mass, potentials = system.kinetic, (system.slow_potential, system.fast_potential)
+    slow_potential, fast_potential = cast(tuple[Callable, Callable], potentials)
     both = scheme.fast.gradient_corrected and fast_potential is not None
 
     def fast(q_f, params):

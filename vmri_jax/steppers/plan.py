@@ -278,20 +278,15 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
         term, rule = potential
         if rule.only_kicks:
             continue
-
-        def value(q_s, q_f, term=term):
-            return term(system.params, q_s=q_s, q_f=q_f)
-
+        sees_slow, sees_fast = depends_on(lambda *q, term=term: term.at(q, system.params), q_s, q_f)
         if rule.grid == "macro":
-            if term.name == "W" or depends_on(partial(value, q_s), q_f)[0]:
+            if term.name == "W" or sees_fast:
                 return None
             slow.append(potential)
         elif term.name == "V" and rule.every == 1:
             return None
         else:
-            may_see_slow = "q_s" in term.arguments and q_s.size > 0
-            sees_slow = may_see_slow and depends_on(partial(value, q_f=q_f), q_s)[0]
-            if sees_slow or (rule.every > 1 and not rule.only_ends):
+            if (sees_slow and q_s.size) or (rule.every > 1 and not rule.only_ends):
                 return None
             fast.setdefault(rule.every, []).append(potential)
     fast = dict(sorted(fast.items()))

@@ -29,18 +29,18 @@ class OfPart:
     """A term that depends on one part alone, as a function of the fast variables of that part, with the time first if
     it is a constraint.
 
-    own, other: names of the positions of the part and of all others.
+    positions, other: names of the positions of the part and of all others.
     num_other: number of the others, which the term gets as zeros.
     """
 
     term: Term
-    own: str
+    positions: str
     other: str
     num_other: int
 
     def __call__(self, *arguments):
         *_, q, params = arguments
-        return self.term(params, **{"t": arguments[0], self.own: q, self.other: jnp.zeros(self.num_other)})
+        return self.term(params, **{"t": arguments[0], self.positions: q, self.other: jnp.zeros(self.num_other)})
 
 
 def part_alone(system: System, part: str, potentials: Sequence[PlacedTerm], num_other: int) -> tuple[System, Scheme]:
@@ -53,8 +53,9 @@ def part_alone(system: System, part: str, potentials: Sequence[PlacedTerm], num_
         potentials: of the variables of the part alone; W, or else V, becomes the fast potential of the new system.
         num_other: number of all other variables.
     """
-    (own, other), constraint = (POSITIONS, "slow_constraint") if part == "slow" else (POSITIONS[::-1], "constraint")
-    alone = partial(OfPart, own=own, other=other, num_other=num_other)
+    constraint = "slow_constraint" if part == "slow" else "constraint"
+    positions, other = POSITIONS if part == "slow" else POSITIONS[::-1]
+    alone = partial(OfPart, positions=positions, other=other, num_other=num_other)
     main = next((placed for name in ("W", "V") for placed in potentials if placed.term.name == name), None)
     further = {placed.term.label: placed for placed in potentials if placed is not main}
     if "V" in further:  # beside W a potential must not be called V, nor as any other one
