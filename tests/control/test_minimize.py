@@ -211,6 +211,7 @@ BY_ARRAY = vm.Problem(vm.System(vm.ConstantMass([1.0], NONE), params=jnp.ones(2)
         ),
         (r"cost is <lambda>\(state\); it is called with \(state, u\)", {"cost": lambda state: state.q_s @ state.q_s}),
         ("cost has shape", {"cost": lambda state, u: u}),
+        ("cost cannot be traced", {"cost": lambda state, u: float(u[0])}),
         (r"cost has \(shape \(\)", {"cost": lambda state, u: (u @ u, u @ u)}),
         ("final_cost has shape", {"final_cost": lambda state: state.q_s}),
         (r"goal has shape \(\); it must be a vector", {"goal": lambda state: state.q_s[0]}),

@@ -49,6 +49,10 @@ def heavier(problem, row):
     return replace(problem, system=problem.system.replace(kinetic=masses))
 
 
+def whole(problem, row):
+    return replace(problem, q_s=problem.q_s * int(row["omega"]))
+
+
 def test_runs_are_those_of_simulate(tmp_path):
     schemes = {"explicit": vm.fully_explicit, "implicit": vm.fully_implicit}
     axes = {"num_micro": [4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[0]": [0.1, 0.3]}
@@ -322,6 +326,7 @@ NO_STEP = {"macro_dt": None}
         ({"vary": lambda problem, row: row}, r"vary\(problem, row\) is dict; give dataclasses\.replace"),
         ({"vary": more_params}, "the structure or shape of one of them"),
         ({"vary": heavier}, "the system besides its params"),
+        ({"vary": whole}, "vary cannot be traced, line .* of test_ensemble.py"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(tmp_path, changes, message):

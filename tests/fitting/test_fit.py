@@ -161,6 +161,10 @@ def without_b(parameters):
     return replace(CHAIN, system=CHAIN.system.replace(params={"omega": parameters["a"]}))
 
 
+def of_whole(parameters):
+    return without_b({"a": float(parameters["a"])})
+
+
 @pytest.mark.parametrize(
     ("message", "call"),
     [
@@ -185,6 +189,7 @@ def without_b(parameters):
         ("all measurements are at the start of the", lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0))),
         ("the model", lambda: vm.fit(cast(Any, lambda p: 3), GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),
         ("segments is 0", lambda: fit(GOOD, segments=0)),
+        ("problem cannot be traced, line .* of test_fit.py", lambda: fit(GOOD, {"a": 19.0}, model=of_whole)),
         ("no measured value depends on b", lambda: fit(GOOD, {"a": 19.0, "b": 1.0}, model=without_b)),
         ("start is a dict; name its numbers one by one", lambda: Unknown(cast(Any, {"stiffness": 1.0}))),
         (

@@ -15,7 +15,7 @@ from vmri_jax.control.transcription import Point, Transcription, held, line_sear
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.by_name import ByName
-from vmri_jax.mechanics.checks import check_number, check_type, describe
+from vmri_jax.mechanics.checks import check_number, check_type, describe, traced
 from vmri_jax.mechanics.functions import check_arguments, order_of, traced_once
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of, start_of
@@ -221,14 +221,16 @@ def transcribed(
     names = problem.names or Names()
     slots = (names.arrays("s", state.q_s.size), names.arrays("f", state.q_f.size))
     actuate = traced_once(ByName(actuate, ("q_s", "q_f", "u", "params"), *slots), order_of(params))
-    forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
+    with traced("minimize: actuate"):
+        forces = jax.eval_shape(actuate, state.q_s, state.q_f, u, params)
     expected = (state.q_s.shape, state.q_f.shape)
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
         raise Refused(f"minimize: actuate returns {forces}; it must return slow and fast forces of shapes {expected}.")
     for name, function in aims.items():
         arguments = {"state": state, "u": u} if name in ("cost", "limits") else {"state": state}
         check_arguments(f"minimize: {name}", function, ", ".join(arguments))
-        value = jax.eval_shape(lambda f=function, g=arguments: f(*g.values()))
+        with traced(f"minimize: {name}"):
+            value = jax.eval_shape(function, *arguments.values())
         dimensions, words = (0, "a number") if name in ("cost", "final_cost") else (1, "a vector, (n,)")
         if getattr(value, "ndim", None) != dimensions:
             raise Refused(f"minimize: {name} has {describe(value)}; it must be {words}.")

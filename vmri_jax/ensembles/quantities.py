@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.catalogue import imported
+from vmri_jax.mechanics.checks import traced
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
@@ -141,7 +142,8 @@ def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
 
 def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, Kept]:
     """The arrays that the store keeps of a run, with shapes in place of values; nothing is computed."""
-    return jax.eval_shape(partial(kept, quantities), resting(run))
+    with traced("ensemble: a function in save"):
+        return jax.eval_shape(partial(kept, quantities), resting(run))
 
 
 def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:

@@ -32,7 +32,7 @@ from vmri_jax.ensembles.design import (
 )
 from vmri_jax.ensembles.quantities import OVER_NODES, Quantity, Saved, label_of, of_lanes, quantity, what_is_kept
 from vmri_jax.mechanics.arrays import is_concrete, whole_number
-from vmri_jax.mechanics.checks import check_type, digest
+from vmri_jax.mechanics.checks import check_type, digest, traced
 from vmri_jax.mechanics.names import Names, near, unknown
 from vmri_jax.mechanics.places import START
 from vmri_jax.mechanics.state import Problem
@@ -279,7 +279,8 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
     Attributes: the design, names of coordinates, the record that identifies the ensemble, versions.
     """
     row, lane = _first_row(design), partial(work.lane, work.problem)  # a problem made within a trace would have tracers
-    used = depends_on(lambda *values: lane(dict(zip(row, values, strict=True))), *row.values())
+    with traced("ensemble: vary"):
+        used = depends_on(lambda *values: lane(dict(zip(row, values, strict=True))), *row.values())
     unused = [name for name, is_used in zip(row, used, strict=True) if not is_used]
     if unused:
         warn_user(f"ensemble: no run depends on {', '.join(unused)}: vary does not use these columns.")

@@ -14,7 +14,7 @@ from vmri_jax.fitting.given import Measured, Unknown, Unknowns
 from vmri_jax.fitting.result import SINGULAR_VALUE_TOLERANCE, Fit, without_starts
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.arrays import split_at, whole_number
-from vmri_jax.mechanics.checks import check_number, check_type
+from vmri_jax.mechanics.checks import check_number, check_type, traced
 from vmri_jax.mechanics.places import Placed, places_of
 from vmri_jax.mechanics.slots import free
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
@@ -98,6 +98,8 @@ def fit(
     whole_number("fit: seed", seed, least=0)
     first = model(unknowns.at(np.zeros(unknowns.size)))
     check_type("fit: the model", first, Problem, "a vmri_jax.Problem from its parameters")
+    with traced("fit: problem"):
+        jax.eval_shape(lambda u: model(unknowns.at(u)).state(), np.zeros(unknowns.size))
     check_step_size(macro_dt, "fit")
     # steps[i] are the numbers of the macro nodes at which the set i of data was measured
     steps = [m.steps(float(first.t), macro_dt) for m in data]

@@ -3,7 +3,8 @@
 import hashlib
 import re
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from types import UnionType
@@ -141,8 +142,25 @@ def shape_of(name: str, function: Callable, *args):
         return value
 
     is_of_package = isinstance(function, TracedOnce) and not function.is_of_user  # its tests differentiate it
-    try:
+    shapes = [getattr(a, "shape", type(a).__name__) for a in args[:-1]]
+    with traced(name, f" on arguments of shapes {shapes} and {'params=None' if args[-1] is None else 'the params'}"):
         shape = jax.eval_shape(called if is_of_package else differentiated_twice, *args)
+    if not isinstance(function, ConstantMass):
+        leaves, structure = jax.tree.flatten(args)
+        fault = _fault(called, structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
+        if fault:
+            raise Refused(f"{name} {fault}.")
+    return shape
+
+
+@contextmanager
+def traced(name: str, on: str = "") -> Iterator[None]:
+    """Refuse a function of the user that fails while JAX traces it; the message names the function, and with `on` its
+    arguments."""
+    try:
+        yield
+    except Refused:
+        raise
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise Refused(
             f"{name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) "
@@ -154,17 +172,7 @@ def shape_of(name: str, function: Callable, *args):
                 f"{name} has no derivative in forward mode{_line_of(error)}: implicit steps take second derivatives, "
                 "which a jax.custom_vjp does not give. Use jax.custom_jvp, which gives both modes."
             ) from error
-        raise Refused(
-            f"{name} could not be evaluated on arguments of shapes "
-            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and "
-            f"{'params=None' if args[-1] is None else 'the params'}{_line_of(error)}: {type(error).__name__}: {error}"
-        ) from error
-    if not isinstance(function, ConstantMass):
-        leaves, structure = jax.tree.flatten(args)
-        fault = _fault(called, structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
-        if fault:
-            raise Refused(f"{name} {fault}.")
-    return shape
+        raise Refused(f"{name} could not be evaluated{on}{_line_of(error)}: {type(error).__name__}: {error}") from error
 
 
 @lru_cache(maxsize=1024)

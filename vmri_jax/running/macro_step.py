@@ -1,7 +1,6 @@
 """A single macro step, without a run."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +8,10 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.checks import check_system, check_type
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import solved_again, unsolved
 from vmri_jax.running.observables import Observables, fault, is_right, observed
+from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import SchemeLike
-from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo
@@ -45,25 +43,20 @@ def macro_step(
     """
     check_type("macro_step: system", system, System, A_SYSTEM)
     check_type("macro_step: state", state, State, "a State, e.g. problem.state()")
-    check_run(system, scheme, state, solver, macro_dt, num_steps=1, t_end=None, save=1)
-    return _macro_step((system, scheme, state, macro_dt, solver or Solver()))
+    return _macro_step(simulation(system, scheme, state, solver, macro_dt, num_steps=1))
 
 
 @jax.jit
-def _macro_step(arguments):
-    system, scheme, state, _, solver = arguments
-    check_system(system, state.q_s, state.q_f)  # here once for each program: a check takes longer than a step
-    if not plan(system, scheme, state, solver).has_fallback:
-        return _step(arguments)
-    exact = partial(_step, exact=True)
-    return solved_again(_step, exact, lambda end: unsolved(end[1].result, end[1].method), arguments)
+def _macro_step(run: Simulation):
+    check_system(run.system, run.state.q_s, run.state.q_f)  # once for each program: a check takes longer than a step
+    if not run.plan.has_fallback:
+        return _step(run)
+    return solved_again(_step, lambda run: _step(run.exact), lambda end: unsolved(end[1].result, end[1].method), run)
 
 
-def _step(arguments, exact: bool = False):
-    system, scheme, state, macro_dt, solver = arguments
-    planned = plan(system, scheme, state, solver.exact() if exact else solver)
-    state, info, _ = planned.step(state, planned.init(state, macro_dt), macro_dt)
-    state, table = observed(system, state, macro_dt, solver.tolerance)
+def _step(run: Simulation):
+    state, info, _ = run.plan.step(run.state, run.plan.init(run.state, run.macro_dt), run.macro_dt)
+    state, table = observed(run.system, state, run.macro_dt, run.solver.tolerance)
     now = Observables.of(table)
     # rows that contradict each other leave increments that converge
     fails = (info.result <= Result.CONVERGED_AT_ROUNDOFF) & ~is_right(now)
