@@ -25,7 +25,7 @@ def least_norm(a, rows):
     xp = np if isinstance(a, np.ndarray) else jnp
     diagonal = xp.diagonal(a)
     root = xp.sqrt(xp.where(diagonal > 0, diagonal, 1.0))
-    return xp.linalg.pinv(a / root[:, None] / root, np.finfo(float).eps * len(a), True) @ (rows / root) / root
+    return xp.linalg.pinv(a / root[:, None] / root, np.finfo(float).eps * len(a)) @ (rows / root) / root
 
 
 def saddle(a, b, c):
