@@ -103,7 +103,8 @@ class MicroSweep(NamedTuple):
             is_first: whether this is the first pass, which computes S.
 
         Returns:
-            (unknowns, the quantities that are handed on, largest correction of a fast increment).
+            (unknowns, the quantities that are handed on, largest correction of a fast increment, or of its part by the
+            multipliers if that is larger: the rest may cancel it, and S, of the first pass, leaves a part of it).
         """
         (x, mu, schur), intervals, solve = guess, self.intervals, self.matrix.solve
         if self.structure.is_explicit:  # K is exact: the increments follow from the multipliers, wherever they start
@@ -116,6 +117,7 @@ class MicroSweep(NamedTuple):
         dx = -solve(intervals.rows(intervals.with_inertia(d, x), arriving.p_f))
         if self.structure.is_explicit:  # the correction is that of the multipliers, below
             x, dx = dx, x
+        worst = 0.0
         if mu.size:
             g, push = jax.linearize(lambda x: intervals.constraints(path._replace(fast=x), m, slice(1, None)), x + dx)
 
@@ -128,9 +130,11 @@ class MicroSweep(NamedTuple):
             schur = only_if(is_first, schur_inverse, schur)
             dmu = -schur.times(g.reshape(-1)).reshape(mu.shape)
             impulses = pull(dmu)
-            dx, mu = dx + solve(intervals.rows(impulses)), mu + dmu
+            by_mu = solve(intervals.rows(impulses))
+            dx, mu = dx + by_mu, mu + dmu
+            worst = max_abs(by_mu)
             d = jax.tree.map(jnp.subtract, d, impulses)
         # gradients at x + dx to first order
         d = jax.tree.map(jnp.add, d, change(dx))
         on = intervals.handed_on(arriving, d, x[-1] + dx[-1])
-        return FastUnknowns(x + dx, mu, schur), on, max_abs(dx)
+        return FastUnknowns(x + dx, mu, schur), on, jnp.maximum(worst, max_abs(dx))
