@@ -21,7 +21,7 @@ from vmri_jax.ensembles.design import SCHEMES, STEPS, columns_of_problems
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.checks import check_flags, check_number
+from vmri_jax.mechanics.checks import check_flags, check_number, check_type
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.places import START, Index, Placed, places_of
 from vmri_jax.mechanics.slots import free
@@ -31,6 +31,8 @@ from vmri_jax.running.export import extra
 
 SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", "project", "chunk")
 """Entries whose names and values are arguments of `ensemble`."""
+KINDS = {"system": (str, '"fpu"'), "out": (str, '"runs.zarr"'), "axes": (dict, "[axes]"), "draws": (dict, "[draws]")}
+"""Kinds of other entries, and what they look like."""
 WORDS = ("unit", "description")
 """Entries of axes and draws that the store keeps with the results."""
 
@@ -90,6 +92,8 @@ def read_sweep(file: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise Refused(f"{file} is no TOML: {error}.") from error
     check_keys(entries, ("system", "scheme", "out"), (*SETTINGS, "axes", "draws"), f"{file}")
+    for name in KINDS.keys() & entries:
+        check_type(f"{file}: {name}", entries[name], *KINDS[name])
     if ("axes" in entries) == ("draws" in entries):
         raise Refused(f"{file}: give either [axes] or [draws].")
     if "axes" in entries:
@@ -98,10 +102,10 @@ def read_sweep(file: Path) -> dict[str, Any]:
         design = _draws(file, entries["draws"])
     folder, scheme = file.resolve().parent, entries["scheme"]
     arguments = {name: entries[name] for name in SETTINGS if name in entries}
-    arguments["save"] = [_located(name, folder) for name in np.atleast_1d(arguments.get("save", "end")).tolist()]
+    arguments["save"] = [_located(str(name), folder) for name in np.atleast_1d(arguments.get("save", "end")).tolist()]
     return arguments | {
         "system": _located(entries["system"], folder),
-        "scheme": scheme if isinstance(scheme, str) else {name: name for name in scheme},
+        "scheme": scheme if isinstance(scheme, str) else {name: name for name in np.atleast_1d(scheme).tolist()},
         "out": folder / entries["out"],
         "design": design,
     }
@@ -125,7 +129,7 @@ def _axis(subject: str, entry) -> Any:
 
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
     check_keys(entries, ("count", "columns"), ("seed", "method"), f"{file}: draws")
-    columns = dict(entries["columns"])
+    columns = dict(check_type(f"{file}: draws.columns", entries["columns"], dict, "[draws.columns]"))
     for name, entry in columns.items():
         if isinstance(entry, Mapping):
             check_keys(entry, ("distribution",), WORDS, f"{file}: draws: {name}")

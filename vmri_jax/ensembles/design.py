@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.names import near, unknown
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
@@ -289,7 +289,7 @@ def _draw(name: str, entry) -> Draw:
         return entry
     if not (isinstance(entry, Sequence) and len(entry) and isinstance(entry[0], str)) or isinstance(entry, str):
         raise Refused(f"Draws: the column {name!r} is {entry!r}; give a distribution, e.g. ('uniform', 10, 50).")
-    return Draw(entry[0], tuple(float(x) for x in entry[1:]))
+    return Draw(entry[0], tuple(map(float, real_array(f"Draws: the column {name!r}", entry[1:], ndim=1))))
 
 
 def _axes(subject: str, columns: Mapping[str, Any]) -> dict[str, Axis]:
