@@ -59,11 +59,6 @@ def implicit_terms(system: System, scheme: Scheme) -> list[TermOnNodes]:
     return [term for term in terms if np.any(term.inside.c > 0)]
 
 
-def _of_fast(term: TermOnNodes, q_s, q_f):
-    """The integrand of a term as a function of q_f."""
-    return term.integrand(*({"q_s": q_s, "q_f": q_f}[name] for name in term.arguments))
-
-
 class DiagonalMatrix(NamedTuple):
     """``K^-1`` as one matrix (r, r) for every fast coordinate."""
 
@@ -116,7 +111,7 @@ class IntervalStructure:
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
         # further potentials may be stiff: K must contain them
         sums = sums and all(term.name in ("V", "W") for term in terms)
-        linear = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
+        linear = all(is_linear(partial(t.integrand, q_s) if "q_s" in t.arguments else t.integrand, q_f) for t in terms)
         linear &= scheme.degree == 1 or q_f.size > SMALL  # few variables and a high degree: one full matrix is cheaper
         is_diagonal = DIAGONAL_MATRICES and constant_mass(system).fast_mass.is_diagonal and (linear or sums)
         is_explicit = scheme.degree == 1 and not terms and system.force is None
