@@ -320,8 +320,7 @@ def columns_of_problems(columns: Sequence[str]) -> list[str]:
 
 def numbers_in(rows: Rows) -> Rows:
     """The columns of numbers that change the problem; steps and schemes are left out."""
-    columns = {name: rows[name] for name in columns_of_problems(list(rows))}
-    for name, values in columns.items():
-        if values.dtype.kind not in "if":
+    for name, values in rows.items():
+        if name != "scheme" and values.dtype.kind not in "if":
             raise Refused(f"ensemble: the column {name!r} has labels; give numbers. Only 'scheme' may have labels.")
-    return columns
+    return {name: rows[name] for name in columns_of_problems(list(rows))}
