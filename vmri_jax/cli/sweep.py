@@ -31,8 +31,6 @@ from vmri_jax.running.export import extra
 
 SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", "project", "chunk")
 """Entries whose names and values are arguments of `ensemble`."""
-KINDS = {"system": (str, '"fpu"'), "out": (str, '"runs.zarr"'), "axes": (dict, "[axes]"), "draws": (dict, "[draws]")}
-"""Kinds of other entries, and what they look like."""
 WORDS = ("unit", "description")
 """Entries of axes and draws that the store keeps with the results."""
 
@@ -57,7 +55,13 @@ def sweep(
     arguments = read_sweep(file)
     problem = find_problem(arguments["system"])
     arguments["vary"] = by_name(problem, list(arguments["design"].described()))
-    drawn = "" if plot is None else _drawn(arguments["save"], problem)
+    drawn = [] if plot is None else drawn_by_default(arguments["save"], problem)
+    if plot is not None and not drawn:  # before anything runs
+        raise Refused(
+            f"--plot draws one number per run or per saved node, and save = {json.dumps(arguments['save'])} keeps "
+            f"neither. Add one to the file, e.g. save = {json.dumps([*arguments['save'], 'energy_error'])}, or a "
+            "function of your own."
+        )
     with _client(workers) as client:
         try:
             runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
@@ -68,19 +72,8 @@ def sweep(
             raise print_failure("Stopped", str(error)) from error
     _print_summary(runs)
     if plot is not None:
-        plots.save(plots.plot_ensemble(runs.open(), drawn, title=file.stem), plot)
-        print_written(f"Figure of {drawn}", plot)
-
-
-def _drawn(save: list[str], problem: Problem) -> str:
-    """The array that --plot draws, chosen before anything runs."""
-    drawn = drawn_by_default(save, problem)
-    if not drawn:
-        raise Refused(
-            f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one "
-            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own."
-        )
-    return drawn[-1]
+        plots.save(plots.plot_ensemble(runs.open(), drawn[-1], title=file.stem), plot)
+        print_written(f"Figure of {drawn[-1]}", plot)
 
 
 def read_sweep(file: Path) -> dict[str, Any]:
@@ -92,8 +85,9 @@ def read_sweep(file: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise Refused(f"{file} is no TOML: {error}.") from error
     check_keys(entries, ("system", "scheme", "out"), (*SETTINGS, "axes", "draws"), f"{file}")
-    for name in KINDS.keys() & entries:
-        check_type(f"{file}: {name}", entries[name], *KINDS[name])
+    kinds = {"system": (str, '"fpu"'), "out": (str, '"a.zarr"'), "axes": (dict, "[axes]"), "draws": (dict, "[draws]")}
+    for name in kinds.keys() & entries:
+        check_type(f"{file}: {name}", entries[name], *kinds[name])
     if ("axes" in entries) == ("draws" in entries):
         raise Refused(f"{file}: give either [axes] or [draws].")
     if "axes" in entries:
@@ -135,8 +129,7 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
             check_keys(entry, ("distribution",), WORDS, f"{file}: draws: {name}")
             draw, words = entry["distribution"], (entry.get("unit", ""), entry.get("description", ""))
             columns[name] = Draw(draw[0], tuple(draw[1:]), *words) if isinstance(draw, list) and draw else draw
-    chosen = {name: entries[name] for name in ("seed", "method") if name in entries}
-    return Draws(entries["count"], columns, **chosen)
+    return Draws(entries["count"], columns, **{name: entries[name] for name in ("seed", "method") if name in entries})
 
 
 def _located(name: str, folder: Path) -> str:
@@ -166,14 +159,15 @@ def _client(workers: str | None) -> Iterator[Any]:
 
 
 def _print_summary(runs: Ensemble) -> None:
-    texts = {
-        "runs": f"{len(runs):,}" + (f", of which {runs.failed_runs:,} failed" if runs.failed_runs else ""),
-        "computed now": f"{runs.computed:,} in {runs.seconds:.1f} s"
-        + (f", {runs.runs_per_second:,.0f} a second" if runs.computed else ""),
-        "chunks": f"{len(runs.done)} of {runs.chunks.count} are in the store, {runs.chunks.size:,} runs each",
-        "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
-    }
-    print_named(texts)
+    print_named(
+        {
+            "runs": f"{len(runs):,}" + (f", of which {runs.failed_runs:,} failed" if runs.failed_runs else ""),
+            "computed now": f"{runs.computed:,} in {runs.seconds:.1f} s"
+            + (f", {runs.runs_per_second:,.0f} a second" if runs.computed else ""),
+            "chunks": f"{len(runs.done)} of {runs.chunks.count} are in the store, {runs.chunks.size:,} runs each",
+            "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
+        }
+    )
 
 
 def by_name(problem: Problem, columns: Sequence[str]) -> Placed | None:
