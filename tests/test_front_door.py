@@ -1,8 +1,11 @@
 """The face of the package: users' names in groups, and nothing else."""
 
+import ast
+import inspect
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -21,6 +24,18 @@ def test_every_name_is_there_and_stands_in_a_group():
     for name in dir(vm):
         assert getattr(vm, name) is not None
         assert name in words, f"help(vmri_jax) does not name {name}"
+
+
+def test_examples_in_docstrings_are_python():
+    """Wrapping has broken one before: lines of code had become one line."""
+    examples = 0
+    for name in dir(vm):
+        text = inspect.cleandoc(getattr(vm, name).__doc__ or "").split("\nArgs:")[0]
+        for example in re.findall(r"(?m)^(?: {4}.+\n?)+", text):
+            if "vm." in example:
+                ast.parse(textwrap.dedent(example))
+                examples += 1
+    assert examples > 5
 
 
 def test_unknown_names_are_refused():

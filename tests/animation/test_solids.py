@@ -67,7 +67,7 @@ def test_balls_rods_plates_and_bodies_without_a_shape():
 
 def test_springs_end_at_points_of_bodies_and_arms_reach_to_joints(run):
     hinge = Revolute(("hub", "arm"), [1.0, 0.2, 2.0], name="hinge")
-    spring = Spring((("hub", [0.5, 0, 0]), ("ground", [3.0, 0, 2.0])), 5.0)
+    spring = Spring((("hub", [0.5, 1e-17, 0]), ("ground", [3.0, 0, 2.0])), 5.0)
     scene = Scene([HUB, ARM], [hinge, spring], project=True, coordinates="directors")
     drawn = scene.drawing()
     assert drawn["links"] == [["arm", "hinge hub-arm in arm"]]  # within the hub there is nothing to see

@@ -72,6 +72,7 @@ def test_parameters_are_found_within_their_errors(found):
     assert 0.01 < found.probability < 0.99
     assert not found.undetermined
     assert "chance of worse" in str(found)
+    assert " +- 200 " in str(replace(found, covariance=4e4 * np.eye(2)))
     titles = [axes.get_title(loc="left") for axes in vm.plots.plot_fit(found).axes]
     assert "correlations" in titles
     assert len(titles) == 4  # with the bar of colours

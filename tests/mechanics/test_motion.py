@@ -22,6 +22,23 @@ def test_a_pendulum_by_the_formula():
     assert np.allclose(found.a_f, pull / MASS - np.array([0.0, GRAVITY]), rtol=1e-13)
 
 
+def test_multipliers_of_rods_that_do_not_couple_have_derivatives():
+    """``lambda_i = -g y_i / |q_i|^2`` of two pendulums at rest; those of `jnp.linalg.lstsq` are NaN, as their
+    singular values are equal."""
+    rods = jax.vmap(lambda q: own_rod([], q, None)[0])
+    system = System(
+        ConstantMass([], np.ones(4)),
+        fast_potential=lambda q, _: GRAVITY * (q[1] + q[3]),
+        constraint=lambda q_s, q_f, params: rods(q_f.reshape(2, 2)),
+    )
+    q = np.array([0.6, -0.8, 0.8, -0.6])
+    zero = np.zeros(4)
+    slope = jax.grad(lambda q: motion(system, State(0.0, zero[:0], q, zero[:0], zero)).multipliers.sum())(q)
+    y, squared = q[1::2], (q.reshape(2, 2) ** 2).sum(axis=1)
+    expected = 2 * GRAVITY * (y / squared**2)[:, None] * q.reshape(2, 2) - GRAVITY / squared[:, None] * np.array([0, 1])
+    assert np.allclose(slope, expected.ravel(), rtol=1e-12)
+
+
 def test_accelerations_are_those_of_runs():
     """Of a mass that depends on the positions."""
     problem = double_pendulum()

@@ -209,6 +209,16 @@ def test_transformations_keep_the_origin(swing):
     assert np.array_equal(jax.tree.map(lambda a: a[1], both).multipliers()["rod"], swing.multipliers()["rod"])
 
 
+def test_multipliers_are_traced(swing):
+    """As a quantity of a store or a derivative needs them; the splines through micro nodes are not."""
+    traced = jax.jit(lambda run: run.multipliers()["rod"])(swing)
+    assert np.allclose(traced, swing.multipliers()["rod"], rtol=1e-12)
+    with pytest.raises(ValueError, match=r"reaction_forces: the run.*run.multipliers\(\), of saved nodes, can"):
+        jax.eval_shape(lambda run: run.reaction_forces(), swing)
+    with pytest.raises(ValueError, match="multipliers: the run is traced"):
+        jax.eval_shape(lambda run: run.multipliers(micro=True), swing)
+
+
 def test_lanes_of_vmap_have_their_parameters():
     def run(m):
         return vm.simulate(replace(WEIGHED, system=WEIGHED.system.replace(params={"m": m})), **HOW)

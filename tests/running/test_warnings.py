@@ -250,7 +250,7 @@ def test_the_steps_have_no_energy_and_one_program_serves_all_lengths():
     for num_steps in (5, 40):
         vm.simulate(moving, EXPLICIT, macro_dt=0.1, num_steps=num_steps)
     prepared = vm.prepare(moving, EXPLICIT, macro_dt=0.1, num_steps=5)
-    program: Any = prepared._pieces.program
+    program: Any = prepared._engine_of_pieces.program
     assert program._cache_size() == 1
     stepper, interval = prepared.plan, _interval(prepared.plan, prepared, partial(jax.lax.fori_loop, 0))
     cursor = Cursor.at_start(prepared.state, stepper.init(prepared.state, prepared.macro_dt))

@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import least_seconds
@@ -89,7 +88,7 @@ def two_families(system: System, degrees_of_freedom: int, digits: float, most_si
     """The usual menu for an accuracy of a number of digits: kicks, composed to an order of about this number, or the
     midpoint rule where masses depend on the configuration; and a single interval of high degree, which carries no rule
     on every k-th micro node, for at most `most_single` degrees of freedom."""
-    base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
+    base = of_order_2(fully_explicit if system.has_constant_mass else fully_implicit)
     name = next((name for most, name in COMPOSED if digits <= most), None)
     kicks = base if name is None else base.composed(name)
     single = replace(of_degree(int(np.clip(np.ceil(digits), 2, 8))), first=1)

@@ -199,8 +199,8 @@ def simulate_batch(
     """Simulate a lane for each set of parameters, start or step size, each as `simulate` would; arrays returned have a
     leading axis of lanes.
 
-        batch = vm.simulate_batch(car, scheme, params={"omega": omegas}, macro_dt=0.01, t_end=10.0)  # a lane for each
-        omega print(batch.lane(3))
+        batch = vm.simulate_batch(car, scheme, params={"omega": omegas}, macro_dt=0.01, t_end=10.0)
+        print(batch.lane(3))  # of omegas[3]
 
     Whatever has no axis of lanes holds for all lanes. Lanes are computed side by side (`jax.vmap`), in chunks that fit
     into the cache. Unlike `simulate`, a failed step never raises: its lane is NaN after the step and has its status in

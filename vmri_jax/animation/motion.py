@@ -125,11 +125,11 @@ def motion(
         raise Refused("motion: the trajectory has no node with finite positions; there is nothing to draw.")
     run = (trajectory if system is None else trajectory.of(system))[:count]
     t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
-    v_s, v_f = map(np.asarray, run.velocities) if run.origin.knows_system else _differences(t, q_s, q_f)
+    v_s, v_f = map(np.asarray, run.velocities) if run.origin.simulated is not None else _differences(t, q_s, q_f)
     all_nodes = Nodes(t, q_s, q_f, v_s, v_f)
     if run.micro is not None and not why_not(t, run.micro):
         all_nodes = with_micro_nodes(all_nodes, *run.micro)
-        if not run.origin.knows_system:  # differences between macro nodes miss the fast motion
+        if run.origin.simulated is None:  # differences between macro nodes miss the fast motion
             all_nodes = all_nodes._replace(v_f=CubicSpline(all_nodes.t, all_nodes.q_f)(all_nodes.t, 1))
     times, *phase = all_nodes
     slow, fast, v_slow, v_fast = drawing.extended(*phase)

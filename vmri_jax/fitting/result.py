@@ -178,7 +178,7 @@ class Fit:
         lines = [f"{label:{width}}  {x:.6g}" for label, x in zip(self.labels, self.values, strict=True)]
         if not self.doubts:
             known = zip(self.standard_errors.values(), self.intervals().values(), strict=True)
-            intervals = [f" +- {s:.2g}   95 %: {low:.6g} .. {high:.6g}" for s, (low, high) in known]
+            intervals = [f" +- {float(f'{s:.2g}'):g}   95 %: {low:.6g} .. {high:.6g}" for s, (low, high) in known]
             lines = [line + interval for line, interval in zip(lines, intervals, strict=True)]
         chance, estimate = f"chance of worse {self.probability:.2g}", f"sigma estimated: {self.sigma:.3g}"
         quality = f"{self.freedom} degrees of freedom ({chance if self.shooting.knows_sigma else estimate})"

@@ -85,7 +85,7 @@ def check_system(system: System, q_s, q_f) -> None:
     """Check the shapes of masses, and of the values of every user function at these positions, by tracing alone."""
     check_params(system.params)
     n_s, n_f = q_s.shape[0], q_f.shape[0]
-    if isinstance(system.kinetic, ConstantMass):
+    if system.has_constant_mass:
         for name, mass, n in (("slow", system.kinetic.slow_mass, n_s), ("fast", system.kinetic.fast_mass, n_f)):
             if mass.size != n:
                 raise Refused(f"ConstantMass: {name} is for {mass.size} coordinates, the state has {n} {name} ones.")

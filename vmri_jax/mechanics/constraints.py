@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_known, numbers_of, quickly_compiled
+from vmri_jax.mechanics.arrays import is_known, numbers_of, quickly_compiled, split_at
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.projection import mass_and_momentum
@@ -19,7 +19,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 
-START = 1e-9
+START_TOLERANCE = 1e-9
 """Largest value of a row at the start, relative to its size. A larger one would start runs off the constraints; a
 smaller one would refuse numbers that are written with ten digits."""
 CONSTRAINT_TOLERANCE = 1e-6
@@ -291,7 +291,7 @@ def _check_gradients(system: System, state, held: list[Held], rows: ScaledRows, 
     positions."""
     q = np.concatenate([state.q_s, state.q_f])
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
-    nearby = configuration(system, state.t, *np.split(q + change, [np.size(state.q_s)])).rows
+    nearby = configuration(system, state.t, *split_at(q + change, np.size(state.q_s))).rows
     size, size_nearby = (np.linalg.norm(a.gradients, axis=1) for a in (rows, nearby))
     vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
     for part in held:
@@ -309,4 +309,4 @@ def _nearby(state, rows: ScaledRows, weights):
     lengths = np.linalg.norm(rows.gradients, axis=1)
     size = NEARBY * np.min(rows.sizes[lengths > 0] / lengths[lengths > 0], initial=np.inf)
     change = np.where(np.isfinite(size), size, 0.0) * np.random.default_rng(0).normal(size=weights.size) / weights
-    return np.split(np.concatenate([state.q_s, state.q_f]) + change, [np.size(state.q_s)])
+    return split_at(np.concatenate([state.q_s, state.q_f]) + change, np.size(state.q_s))

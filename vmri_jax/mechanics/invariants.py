@@ -1,8 +1,5 @@
 """Quantities that a trajectory conserves: energy, momentum maps, constraints; and velocities."""
 
-from functools import reduce
-from operator import add
-
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import split_at
@@ -47,7 +44,7 @@ def energy(system: System, q_s, q_f, p_s, p_f):
         q_s, q_f: (n_s,) and (n_f,) positions.
         p_s, p_f: (n_s,) and (n_f,) momenta.
     """
-    return reduce(add, energy_parts(system, q_s, q_f, p_s, p_f).values())
+    return sum(energy_parts(system, q_s, q_f, p_s, p_f).values())
 
 
 def oscillatory_energies(omega, q_f, p_f):

@@ -181,7 +181,7 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
         gradient, times_hessian = jax.linearize(jax.grad(lambda v: kinetic(system, q_s, q_f, v)), v)
         matrix = saddle(jax.vmap(times_hessian)(jnp.eye(v.size)), jacobian.T, jacobian)
         rows = jnp.concatenate([p - gradient, -(jacobian @ v + rates)])
-        d, mu = jnp.split(kernels.solve(matrix, rows[:, None])[:, 0], [v.size])
+        d, mu = split_at(kernels.solve(matrix, rows[:, None])[:, 0], v.size)
         # |d| / |v| in the norm of the mass matrix T''
         squared = (d @ times_hessian(d)) / jnp.maximum(v @ times_hessian(v), jnp.finfo(float).tiny)
         return d, jacobian.T @ mu, jnp.sqrt(squared)

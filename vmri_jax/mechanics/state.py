@@ -16,7 +16,7 @@ from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, is_kn
 from vmri_jax.mechanics.by_name import constraint_sizes, flat_system
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.consistent import consistent_momenta, project_positions
-from vmri_jax.mechanics.constraints import START, check_constraints, check_mass
+from vmri_jax.mechanics.constraints import START_TOLERANCE, check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.slots import Slots
@@ -69,7 +69,7 @@ def initial_state(
     t: Number | None = None,
     *,
     project: bool | None = None,
-    tolerance=START,
+    tolerance=START_TOLERANCE,
 ) -> State:
     """Consistent state from positions and velocities: ``p = dT/dv``, projected onto the hidden constraints.
 

@@ -27,7 +27,7 @@ from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
 from vmri_jax.running.saved import Saved, check_memory
 from vmri_jax.running.simulation import STEPPING, Simulation, simulation
-from vmri_jax.schemes.composition import SchemeLike, stage_scheme
+from vmri_jax.schemes.composition import SchemeLike
 
 NUMBERS_PER_CHUNK = 4096
 """Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of
@@ -180,8 +180,7 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State,
 def lanes_at_once(run: Simulation) -> int:
     """Lanes of a chunk where the user gives none: the largest power of two that fits into the cache, between the two
     limits."""
-    nodes = run.scheme.num_micro * stage_scheme(run.scheme).degree
-    numbers_per_lane = nodes * (run.state.q_s.size + run.state.q_f.size)
+    numbers_per_lane = run.scheme.num_micro * run.scheme.degree * (run.state.q_s.size + run.state.q_f.size)
     return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane, FEWEST_LANES, MOST_LANES)))
 
 

@@ -107,7 +107,7 @@ class Engine:
         room = (self.num_saves // self._block + 1) * self._block  # of whole blocks
         rows = jnp.zeros((room, run.width))  # `jax_debug_nans` stops a program that returns NaN
         _, end, rows = jax.lax.while_loop(goes_on, save, (jnp.asarray(0), begin, rows))
-        rows = self._observed(run, rows, begin.step, save_every, self.num_saves if saves is None else saves)
+        rows = self._rows_as_saved(run, rows, begin.step, save_every, self.num_saves if saves is None else saves)
         return rows, jnp.stack([end.result, end.failed_at]) if cursor is None else end
 
     @property
@@ -115,7 +115,7 @@ class Engine:
         """Nodes whose observables are computed side by side."""
         return min(NODES_AT_ONCE, self.num_saves + 1)
 
-    def _observed(self, run, rows, step, save_every, saves):
+    def _rows_as_saved(self, run, rows, step, save_every, saves):
         """The rows as they are saved, block by block, up to the node `saves`, and copies of this node up to the end of
         its block."""
 
@@ -151,15 +151,16 @@ class Engine:
         return jax.jit(by_scan, static_argnums=1)
 
     @cached_property
-    def observed(self):
-        """``observed(leaves, saved, save_every)``: the nodes of `differentiable` as they are saved, with failures."""
+    def nodes_as_saved(self):
+        """``nodes_as_saved(leaves, saved, save_every)``: the nodes of `differentiable` as they are saved, with
+        failures."""
 
-        def observed(leaves: list, saved: Saved, save_every) -> Saved:
+        def nodes_as_saved(leaves: list, saved: Saved, save_every) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
             nodes = _as_saved(run, saved.nodes, jnp.arange(self.num_saves + 1) * save_every)
             return saved._replace(nodes=nodes).marked(replace(run, save_every=save_every))
 
-        return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
+        return jax.jit(nodes_as_saved)  # else JAX would compile the operations of a gradient outside of jit one by one
 
 
 engine = lru_cache(maxsize=32)(Engine)
@@ -212,7 +213,7 @@ def _interval(stepper: Plan, run, repeat: Callable):
         alive = cursor.failed_at < 0
         state, info, memory = stepper.step(cursor.state, cursor.memory, macro_dt)
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
-        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info.status)
+        worst = jax.tree.map(partial(jnp.where, alive), worst.worse(info.status), worst)
         # NaN in the momenta alone: the next step carries it into all positions.
         p_s, p_f = (jnp.where(ok, p, jnp.nan) for p in (state.p_s, state.p_f))
         # t_k = t_0 + k H from the step number, since a sum of steps would accumulate round-off; the time of the stepper
@@ -237,18 +238,17 @@ def unsolved(result, method):
     return (result > Result.CONVERGED_AT_ROUNDOFF) & (result != Result.NOT_IMPLIED) & (method > Method.LINEAR)
 
 
-def solved_again(first: Callable, exact: Callable, failed: Callable, arguments: Any) -> Any:
-    """``first(arguments)``, or ``exact(arguments)`` where that has failed, in one program, to be transformed.
+def solved_again(first: Callable, exact: Callable, status: Callable, arguments: Any) -> Any:
+    """``first(arguments)``, or ``exact(arguments)`` where that is `unsolved`, in one program, to be transformed.
 
     The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs.
-    Values of the two differ by the tolerance of the solver. ``failed(value)`` says whether a value of `first` is
-    computed again.
+    Values of the two differ by the tolerance of the solver. ``status(value)`` is (result, method) of a value.
     """
 
     @jax.custom_jvp
     def run(arguments):
         value = first(arguments)
-        return jax.lax.cond(failed(value), lambda: exact(arguments), lambda: value)
+        return jax.lax.cond(unsolved(*status(value)), lambda: exact(arguments), lambda: value)
 
     run.defjvp(lambda primals, tangents: jax.jvp(exact, primals, tangents))
     return run(arguments)

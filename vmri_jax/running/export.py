@@ -87,7 +87,7 @@ class Exports(Quantities):
             raise Refused("columns: this is a batch of runs; take one of them, run.lane(i).")
         rows = rows_of(self)
         parts = [("", rows["q_s"], rows["q_f"]), ("p ", rows["p_s"], rows["p_f"])]
-        if self.origin.knows_system:
+        if self.origin.simulated is not None:
             v_s, v_f = map(np.asarray, self.velocities)
             parts.insert(1, ("v ", v_s, v_f))
         columns = [("t", rows["t"])]

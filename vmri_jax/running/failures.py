@@ -102,7 +102,7 @@ def simulation_error(run: Any, trajectory: SavedRun) -> SimulationError:
     failed_at, dt = int(trajectory.failed_at), float(run.macro_dt)
     interval, step = divmod(failed_at, run.save_every)
     part, moved, jump = trajectory[interval : interval + 2], "", ""  # from the node before the failure
-    if trajectory.origin.knows_system:
+    if trajectory.origin.simulated is not None:
         system, before = trajectory.origin.system(), part[0]
         motion = largest_motion(system, before, part.names, dt, run.scheme.num_micro)
         moved = "" if motion is None else motion.sentence(dt)

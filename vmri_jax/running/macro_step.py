@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.checks import check_system, check_type
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.engine import solved_again, unsolved
+from vmri_jax.running.engine import solved_again
 from vmri_jax.running.observables import Observables, fault, is_right, observed
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import SchemeLike
@@ -51,7 +51,7 @@ def _macro_step(run: Simulation):
     check_system(run.system, run.state.q_s, run.state.q_f)  # once for each program: a check takes longer than a step
     if not run.plan.has_fallback:
         return _step(run)
-    return solved_again(_step, lambda run: _step(run.exact), lambda end: unsolved(end[1].result, end[1].method), run)
+    return solved_again(_step, lambda run: _step(run.exact), lambda end: end[1].status[:2], run)
 
 
 def _step(run: Simulation):

@@ -116,11 +116,6 @@ class Origin:
         """The origin of a batch of runs: a view of every array with the axes of lanes, without copies."""
         return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (*lanes, *np.shape(leaf))), self) if lanes else self
 
-    @property
-    def knows_system(self) -> bool:
-        """Whether the system is known."""
-        return self.simulated is not None
-
     def system(self, axes: int = 0) -> System:
         """The system with the parameters of the run, which has a number of axes of lanes: of its first lane."""
         if self.simulated is None:

@@ -76,7 +76,7 @@ class Quantities:
         """Names of bodies, coordinates and constraints, plain ones where none are known."""
         n_s, n_f = self.states.q_s.shape[-1], self.states.q_f.shape[-1]
         names = self.origin.names or Names()
-        if not self.origin.knows_system:
+        if self.origin.simulated is None:
             return names.of_coordinates(n_s, n_f)
         return names.of(self.origin.system(np.ndim(self.energy) - 1), n_s, n_f)
 
@@ -151,9 +151,11 @@ class Quantities:
         Raises:
             ValueError: the run does not know its system, or did not keep the micro nodes.
         """
-        self._check_concrete("multipliers")
+        if micro:  # the spline through the nodes is one of SciPy
+            self._check_concrete("multipliers")
         values = at_nodes(motion, self.origin, _states(self, micro)).multipliers
-        return {name: _shaped(self, values[..., rows], micro) for name, rows in self.names.rows.items()}
+        shape = np.shape(self.micro.t if micro else self.states.t)
+        return {name: values[..., rows].reshape(*shape, -1) for name, rows in self.names.rows.items()}
 
     def reaction_forces(self, constraint: str | None = None, micro: bool = False) -> dict:
         """Forces ``-G^T lambda`` of a constraint on the bodies that it touches, (..., k, size) for each of them by
@@ -181,13 +183,14 @@ class Quantities:
             of_constraint[numbers] = True
         chosen = np.broadcast_to(chosen, (*np.shape(states.t), *chosen.shape))  # at every node
         forces, touched = at_nodes(reaction_forces, self.origin, (states, chosen))
+        shape = np.shape(self.micro.t if micro else self.states.t)
         first = {"s": 0, "f": self.states.q_s.shape[-1]}
         by_constraint: dict[str, dict] = {name: {} for name in rows}
         for body, (part, start, size) in names.bodies.items():
             columns = slice(first[part] + start, first[part] + start + size)
             for i, by_body in enumerate(by_constraint.values()):
                 if touched[..., i, columns].any():
-                    by_body[body] = _shaped(self, forces[..., i, columns], micro)
+                    by_body[body] = forces[..., i, columns].reshape(*shape, -1)
         return by_constraint if constraint is None else by_constraint[constraint]
 
     def work(self) -> Work:
@@ -234,9 +237,8 @@ class Quantities:
         """Refuse a run whose numbers are tracers of a transformation."""
         if not is_concrete(self.energy):
             raise Refused(
-                f"{method}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
-                f"run.of(problem).{method}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can "
-                "be traced."
+                f"{method}: the run is traced by JAX, inside of jit, grad, vmap or save= of an ensemble. Return the "
+                f"run and ask outside, run.of(problem).{method}(...); run.multipliers(), of saved nodes, can be traced."
             )
 
     def plot(self, title: str = ""):
@@ -290,10 +292,6 @@ def _all_nodes(run: SavedRun) -> Nodes:
     all_nodes = with_micro_nodes(macro_nodes, run.micro.t[: count - 1], run.micro.q_f[: count - 1])
     missing = (len(nodes.t) - count) * run.micro.t.shape[1]
     return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in all_nodes))
-
-
-def _shaped(run: SavedRun, values: np.ndarray, micro: bool) -> np.ndarray:
-    return values.reshape(*np.shape(run.micro.t), -1) if micro else values
 
 
 def _deviation_of_integral(t: np.ndarray, power: np.ndarray) -> float:

@@ -178,14 +178,11 @@ class Simulation:
         def steps(run: Simulation) -> Callable[[list], Saved]:
             return lambda leaves: run.engine.differentiable(leaves, run.save_every)
 
-        def failed(saved: Saved):
-            return unsolved(saved.result, saved.method)
-
         run = steps(self)
         if self.plan.has_fallback:
-            run = partial(solved_again, run, steps(self.exact), failed)
+            run = partial(solved_again, run, steps(self.exact), lambda saved: (saved.result, saved.method))
         saved = run(self.leaves)
-        return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
+        return self.engine.nodes_as_saved(self.leaves, saved, self.save_every).trajectory(self)
 
     def finished(self, caller: str, saved: Saved, throw: bool = True, is_told: bool = False) -> Trajectory:
         """The trajectory of a whole run, or of runs with an axis of lanes, after the warnings about its start, unless
@@ -269,14 +266,14 @@ class Simulation:
         return self._engine(self.num_saves)
 
     @cached_property
-    def _pieces(self) -> Engine:
+    def _engine_of_pieces(self) -> Engine:
         """Its programs for pieces, of a size for runs of all lengths, which then share them, without the fallback."""
         return self._engine(max(NUMBERS_PER_PIECE // self.width, 1))
 
     @cached_property
     def blank_memory(self) -> Any:
         """Zeros in the shapes of the memory of its stepper."""
-        return blank_memory(self._pieces, tuple((a.shape, a.dtype) for a in self.leaves))
+        return blank_memory(self._engine_of_pieces, tuple((a.shape, a.dtype) for a in self.leaves))
 
     def _engine(self, num_saves: int) -> Engine:
         motion = Simulation(*(getattr(self, name) for name in MOTION), save=Save(micro=self.save.micro))
@@ -301,7 +298,7 @@ class Simulation:
 
         After a failure nothing is computed, and all further nodes are NaN.
         """
-        run, pieces, room = self, [], self._pieces.num_saves
+        run, pieces, room = self, [], self._engine_of_pieces.num_saves
         for done in range(0, saves, room):
             size = min(room, saves - done)
             piece, after = run._advance(cursor, size)
@@ -317,7 +314,7 @@ class Simulation:
         step, is_first = int(cursor.step), cursor.memory is None
         if is_first:
             cursor = cursor._replace(memory=self.blank_memory)
-        rows, cursor = self._pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
+        rows, cursor = self._engine_of_pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
         saved = Saved(self.columns.split(nodes), np.asarray(cursor.result), np.asarray(cursor.failed_at)).marked(
             self, step

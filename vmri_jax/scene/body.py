@@ -32,8 +32,10 @@ class Attachment(str):
     @property
     def label(self) -> str:
         """``hub (0.5, 0, 0)``."""
-        numbers = ", ".join(f"{x:g}" for x in self.offset) if is_concrete(self.offset) else "a point"
-        return f"{self} ({numbers})"
+        if not is_concrete(self.offset):
+            return f"{self} (a point)"
+        round_off = 1e-12 * np.max(np.abs(self.offset))
+        return f"{self} ({', '.join(f'{x:g}' if abs(x) > round_off else '0' for x in self.offset)})"
 
 
 def is_entry(item: Any) -> bool:

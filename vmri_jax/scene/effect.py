@@ -13,7 +13,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.checks import describe, shape_of
-from vmri_jax.mechanics.constraints import START
+from vmri_jax.mechanics.constraints import START_TOLERANCE
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
@@ -249,7 +249,7 @@ class Effect(Bindable):
                 continue
             values = np.broadcast_arrays(np.atleast_1d(kept), start)
             for element, kept, measured in zip(self.elements, *values, strict=True):
-                agrees = abs(kept - measured) <= START * kept
+                agrees = abs(kept - measured) <= START_TOLERANCE * kept
                 expected = (
                     f"it starts as {measured:.12g}; give this value, move a body, or let the scene do so, project=True"
                 )

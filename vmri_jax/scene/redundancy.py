@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
-from vmri_jax.mechanics.constraints import RANK, START, rank_of
+from vmri_jax.mechanics.constraints import RANK, START_TOLERANCE, rank_of
 from vmri_jax.mechanics.slopes import ROUNDING
 from vmri_jax.mechanics.summary import listed
 from vmri_jax.refusals import Refused
@@ -82,7 +82,7 @@ def check_constraints(sorting: Sorting, moved: bool) -> None:
     violations = np.abs(rows.evaluate(0.0, sorting.assembled)[0])
     # far from the origin positions are rounded by more than a part of the extent of the scene
     reach = np.abs(rows.jacobian).sum(axis=1) * np.abs(sorting.of_bodies("coordinates")).max()
-    violated = np.flatnonzero(violations > START * rows.sizes + ROUNDING * np.finfo(float).eps * reach)
+    violated = np.flatnonzero(violations > START_TOLERANCE * rows.sizes + ROUNDING * np.finfo(float).eps * reach)
     if violated.size and not moved:
         raise Refused(
             f"Scene: the positions at the start violate {rows.rows[violated[0]].name} by "

@@ -24,9 +24,9 @@ import jax.numpy as jnp
 
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.system import ConstantMass, System
-from vmri_jax.mechanics.terms import Term
+from vmri_jax.mechanics.terms import POSITIONS, Term
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.path import Nodes, lagrange_derivative, position_nodes, slow_velocity_nodes, velocity_nodes
+from vmri_jax.schemes.path import Nodes, lagrange_derivative, position_nodes, velocity_nodes
 from vmri_jax.schemes.quadrature import PlacedRule
 from vmri_jax.schemes.scheme import Scheme
 
@@ -40,7 +40,7 @@ class TermOnNodes:
     start, end: weights at the ends of the macro interval, for terms without velocities; None without such a node. These
         nodes are kicks.
     sign: of the term in the Lagrangian.
-    grid, every: placement of its rule, see `PlacedRule`.
+    grid: of its rule, see `PlacedRule`.
     mollified: whether kicks take averaged fast positions.
     power: further powers of H in front of the sum, for corrections.
     name: for texts.
@@ -53,7 +53,6 @@ class TermOnNodes:
     end: Any = None
     sign: float = 1.0
     grid: str = "micro"
-    every: int = 1
     mollified: bool = False
     power: int = 0
     name: str = ""
@@ -62,13 +61,16 @@ class TermOnNodes:
         """The factor ``H^(1 + power)`` of the weights."""
         return macro_dt ** (1 + self.power)
 
+    def at(self, q_s, q_f):
+        """The integrand at one configuration, of a term without velocities."""
+        q = dict(zip(POSITIONS, (q_s, q_f), strict=True))
+        return self.integrand(*(q[name] for name in self.arguments))
+
     def gradient(self, q_s, q_f):
         """``(d/dq_s, d/dq_f)`` of the signed integrand at one configuration, for kicks."""
-        q = {"q_s": q_s, "q_f": q_f}
-        grads = jax.grad(self.integrand, argnums=tuple(range(len(self.arguments))))(*(q[a] for a in self.arguments))
-        q |= {a: jnp.zeros_like(x) for a, x in q.items()}
-        q |= {a: self.sign * g for a, g in zip(self.arguments, grads, strict=True)}
-        return q["q_s"], q["q_f"]
+        by_position = zip(POSITIONS, jax.grad(self.at, argnums=(0, 1))(q_s, q_f), strict=True)
+        # the derivative by an argument that the term does not have stays 0: XLA would add a -0
+        return tuple(self.sign * d if name in self.arguments else d for name, d in by_position)
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,6 @@ class QuadraticKinetic:
 
     mass: ConstantMass
     nodes: Nodes
-    start = end = None
 
     @property
     def slow_form(self):
@@ -110,15 +111,12 @@ class QuadraticKinetic:
 
 
 @dataclass(frozen=True)
-class Sum:
-    """A sum of terms."""
+class Lagrangian:
+    """A sum of terms, and the `QuadraticKinetic` of constant masses; None for a kinetic energy that is a function, and
+    then among the terms."""
 
-    terms: tuple[Any, ...]  # of TermOnNodes and QuadraticKinetic
-
-    @property
-    def kinetic(self) -> QuadraticKinetic:
-        """The kinetic energy of constant masses."""
-        return next(term for term in self.terms if isinstance(term, QuadraticKinetic))
+    kinetic: Any
+    terms: tuple[TermOnNodes, ...]
 
     @property
     def kicks(self) -> tuple[TermOnNodes, ...]:
@@ -142,13 +140,16 @@ def placed_potentials(system: System, scheme: Scheme) -> tuple[PlacedTerm, ...]:
     return tuple(PlacedTerm(term, scheme.rule_of(term.name)) for term in system.of_kind("potential"))
 
 
-def lagrangian(system: System, scheme: Scheme) -> Sum:
+def lagrangian(system: System, scheme: Scheme) -> Lagrangian:
     """``T - V - W - sum_i V_i`` of a system, each term on the nodes the scheme gives it."""
     potentials = [
         _on_position_nodes(term.function, term.arguments, rule, scheme, system, term.label, sign=-1.0)
         for term, rule in placed_potentials(system, scheme)
     ]
-    return Sum((*_kinetic(system, scheme), *potentials, *_corrections(system, scheme)))
+    nodes = velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
+    masses = QuadraticKinetic(system.kinetic, nodes) if system.has_constant_mass else None
+    kinetic = [] if system.has_constant_mass else _kinetic_functions(system, scheme, nodes)
+    return Lagrangian(masses, (*kinetic, *potentials, *_corrections(system, scheme)))
 
 
 def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
@@ -160,7 +161,7 @@ def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
     """
     if not scheme.slow.gradient_corrected and not scheme.fast.gradient_corrected:
         return []
-    if not isinstance(system.kinetic, ConstantMass):
+    if not system.has_constant_mass:
         raise Refused("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
     mass, potentials = system.kinetic, (system.slow_potential, system.fast_potential)
     slow_potential, fast_potential = cast(tuple[Callable, Callable], potentials)
@@ -186,19 +187,16 @@ def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
     return [_on_position_nodes(*correction, power=2) for correction in corrections]
 
 
-def _kinetic(system, scheme) -> list:
-    nodes = velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
-    if isinstance(system.kinetic, ConstantMass):
-        return [QuadraticKinetic(system.kinetic, nodes)]
+def _kinetic_functions(system, scheme, nodes: Nodes) -> list[TermOnNodes]:
     both, slow = system.kinetic, system.slow_kinetic
     terms = [TermOnNodes(lambda *z: both(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes)]
     if slow is not None:
-        nodes = slow_velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
+        nodes = velocity_nodes(scheme.kinetic, 1, scheme.degree)  # the macro interval as one micro interval
         terms.append(TermOnNodes(lambda *z: slow(*z, system.params), ("q_s", "v_s"), nodes, grid="macro"))
     return terms
 
 
 def _on_position_nodes(function, arguments, placed, scheme, system, name: str, **fields) -> TermOnNodes:
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
-    fields |= {"grid": placed.grid, "every": placed.every, "mollified": placed.mollified, "name": name}
+    fields |= {"grid": placed.grid, "mollified": placed.mollified, "name": name}
     return TermOnNodes(lambda *q: function(*q, system.params), arguments, inside, start, end, **fields)

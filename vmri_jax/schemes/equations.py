@@ -28,8 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import Number, Numbers
-from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.arrays import Number, Numbers, split_at
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
@@ -63,7 +62,7 @@ class StepEquations(eqx.Module):
 
     `vmri_jax.schemes.intervals.Intervals` evaluates them.
 
-    before: length of the step before, whose momenta are off the hidden constraints; 0 for momenta on them.
+    last_dt: length of the step before, whose momenta are off the hidden constraints; 0 for momenta on them.
     masses: mass matrix ``d2T/dv2`` (n, n) at the start of the step, of a kinetic energy that is a function; solvers
         need it.
     """
@@ -76,13 +75,13 @@ class StepEquations(eqx.Module):
     p_s: Float[Numbers, "n_s"]
     p_f: Float[Numbers, "n_f"]
     macro_dt: Number
-    before: Number = 0.0
+    last_dt: Number = 0.0
     masses: Float[Numbers, "n n"] | None = None
 
     @classmethod
-    def of(cls, system: System, scheme: Scheme, state: State, macro_dt, before: Number = 0.0) -> "StepEquations":
+    def of(cls, system: System, scheme: Scheme, state: State, macro_dt, last_dt: Number = 0.0) -> "StepEquations":
         """The equations of a step from a state, without `masses`."""
-        return cls(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt, before)
+        return cls(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt, last_dt)
 
     @property
     def micro_dt(self):
@@ -91,10 +90,10 @@ class StepEquations(eqx.Module):
 
     def mass_diagonal(self):
         """Diagonals (n_s,) and (n_f,) of the constant masses, or of `masses`."""
-        if isinstance(self.system.kinetic, ConstantMass):
+        if self.system.has_constant_mass:
             return self.system.kinetic.diagonal
         assert self.masses is not None
-        return tuple(jnp.split(jnp.diagonal(self.masses), [self.q_s.size]))
+        return split_at(jnp.diagonal(self.masses), self.q_s.size)
 
     def guess(self, v_s, v_f, multiplier, slow_multiplier) -> Unknowns:
         """Straight motion at these velocities, with these (physical) multipliers at all nodes."""
@@ -110,21 +109,21 @@ class StepEquations(eqx.Module):
     def multiplier_scales(self):
         """The factors of the multipliers in the unknowns: ``mu / lambda`` (num_micro, r, 1) of g, and (r, 1) of g_s.
 
-        With the weights w_0..w_r of the constraint rule on its unit interval, and H_before, the factors of g are
+        With the weights w_0..w_r of the constraint rule on its unit interval, and H_last, the factors of g are
 
-            h^2 (w_0 + (H_before / H) w_r)  at the start of the step
-            h^2 (w_0 + w_r)                 where micro intervals meet
-            h^2 w_j                         inside
+            h^2 (w_0 + (H_last / H) w_r)  at the start of the step
+            h^2 (w_0 + w_r)               where micro intervals meet
+            h^2 w_j                       inside
 
-        and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0
+        and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_last / H) w_r)`` at S_0
         and ``H^2 w_i`` at S_i: the constraint force that the step before has left out at the common node belongs to
         this step.
         """
         scheme, macro_dt = self.scheme, self.macro_dt
         w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))
         starts, first = np.eye(1, w.size - 1), np.eye(scheme.num_micro, 1)
-        shared = w[:-1] + (1 + first * (self.before / macro_dt - 1)) * starts * w[-1]
-        slow_shared = w_slow[:-1] + self.before / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
+        shared = w[:-1] + (1 + first * (self.last_dt / macro_dt - 1)) * starts * w[-1]
+        slow_shared = w_slow[:-1] + self.last_dt / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
         return self.micro_dt**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
 
     def multipliers(self, x: Unknowns, multiplier, slow_multiplier):
@@ -135,11 +134,11 @@ class StepEquations(eqx.Module):
             x: unknowns.
             multiplier, slow_multiplier: (n_g,) and (n_gs,) multipliers of the step before.
         """
-        cancels = jnp.abs(self.macro_dt + self.before) < LEAST_SUM * jnp.abs(self.macro_dt)
-        scaled, last = (x.multiplier, x.slow_multiplier), (multiplier, slow_multiplier)
+        cancels = jnp.abs(self.macro_dt + self.last_dt) < LEAST_SUM * jnp.abs(self.macro_dt)
+        scaled = x.multiplier, x.slow_multiplier
         return tuple(
-            jnp.where(cancels, before, mu / jnp.where(cancels, 1.0, scale))
-            for mu, scale, before in zip(scaled, self.multiplier_scales(), last, strict=True)
+            jnp.where(cancels, last, mu / jnp.where(cancels, 1.0, scale))
+            for mu, scale, last in zip(scaled, self.multiplier_scales(), (multiplier, slow_multiplier), strict=True)
         )
 
 

@@ -40,7 +40,7 @@ class IntervalNodes:
         n, r = nodes.num_micro, nodes.degree
         c, of = np.zeros((n, len(rows))), np.full((n, len(rows)), -1)
         for k, row in enumerate(rows):
-            c[nodes.interval[row], k], of[nodes.interval[row], k] = nodes.c[row], nodes.of[row]
+            c[nodes.interval[row], k], of[nodes.interval[row], k] = nodes.c[row], nodes.number[row]
         self.has_nodes: np.ndarray = np.any(of >= 0, axis=1)
         if (of == of[0]).all():
             self.weights = nodes.distinct[of[:1]]  # of all intervals

@@ -36,7 +36,7 @@ from jaxtyping import Array, Float
 from vmri_jax.kernels import matmul, matvec
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.structure import entries_seen
-from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.interval_nodes import IntervalNodes, IntervalPath, of_interval, with_unseen
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative, velocity_nodes
@@ -78,12 +78,11 @@ class Intervals:
 
     def __init__(self, equations: StepEquations):
         self.equations = equations
-        terms = lagrangian(equations.system, equations.scheme).terms
-        self.kinetic = next((term for term in terms if isinstance(term, QuadraticKinetic)), None)
-        inner = [term for term in terms if isinstance(term, TermOnNodes) and len(term.inside.c)]
-        of_slow = [all(name.endswith("_s") for name in term.arguments) for term in inner]
-        self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
-        of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
+        of_step = lagrangian(equations.system, equations.scheme)
+        self.kinetic, inner = of_step.kinetic, [term for term in of_step.terms if len(term.inside.c)]
+        sees_fast = {"q_f", "v_f"}.intersection
+        self._slow_terms = [term for term in inner if not sees_fast(term.arguments)]
+        of_fast = (term for term in inner if sees_fast(term.arguments))
         self.terms = [(term, nodes) for term in of_fast for nodes in IntervalNodes.of(term.inside)]
         n, r, has_force = equations.scheme.num_micro, equations.scheme.degree, equations.system.force is not None
         self._force_nodes = IntervalNodes.of(velocity_nodes(equations.scheme.force, n, r)) if has_force else []

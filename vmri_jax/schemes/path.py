@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, library
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, lobatto, macro
+from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, lobatto
 
 
 def control_nodes(degree: int) -> np.ndarray:
@@ -53,13 +53,13 @@ class Nodes:
     """The k quadrature nodes of one term on the macro interval.
 
     interval, c: (k,) micro interval of each node, and its local coordinate there.
-    of: (k,) number of its weight.
+    number: (k,) number of its weight among the distinct ones.
     distinct: the weights; the copies of a node have one.
     """
 
     interval: Int[np.ndarray, "k"]
     c: Float[np.ndarray, "k"]
-    of: Int[np.ndarray, "k"]
+    number: Int[np.ndarray, "k"]
     distinct: Float[Numbers, "w"]
     num_micro: int
     degree: int
@@ -67,7 +67,7 @@ class Nodes:
     @property
     def weights(self):
         """(k,) weights."""
-        return self.distinct[self.of]
+        return self.distinct[self.number]
 
     @property
     def theta(self) -> np.ndarray:
@@ -91,12 +91,6 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
     return nodes
 
 
-def slow_velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
-    """Nodes of a term that depends on slow positions and velocities alone: the nodes of the rule, once on the macro
-    interval."""
-    return _nodes(macro(placed.rule), num_micro, degree, range(len(placed.rule.nodes)))
-
-
 def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any, Nodes, Any]:
     """Nodes of a term that depends on positions only: (weight at 0, nodes inside, weight at 1).
 
@@ -104,12 +98,12 @@ def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any
     of its equations. Their weight is None if the rule has no such node. Where two copies of the rule meet, the right
     node of the first copy and the left node of the second are one node.
     """
-    rule, size, every = placed.rule, placed.copies(num_micro), placed.every
+    rule, copies, every = placed.rule, placed.copies(num_micro), placed.every
     has_start, has_end = rule.nodes[0] <= NODE_TOLERANCE, rule.nodes[-1] >= 1 - NODE_TOLERANCE
-    start = rule.weights[0] / size if has_start else None
-    end = rule.weights[-1] / size if has_end else None
+    start = rule.weights[0] / copies if has_start else None
+    end = rule.weights[-1] / copies if has_end else None
     inside = range(has_start, len(rule.nodes) - has_end)
-    meets = range(every, num_micro, every) if size > 1 and (has_start or has_end) else range(0)
+    meets = range(every, num_micro, every) if copies > 1 and (has_start or has_end) else range(0)
     meeting = sum(w for w in (start, end) if w is not None)
     return start, _nodes(placed, num_micro, degree, inside, meets, meeting), end
 

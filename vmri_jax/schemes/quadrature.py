@@ -260,15 +260,12 @@ class PlacedRule(eqx.Module):
 
     @property
     def only_kicks(self) -> bool:
-        """Whether all nodes are ends of the macro interval: kicks at macro nodes alone.
-
-        Kicks at micro nodes have `only_ends`.
-        """
+        """Whether all nodes are ends of the macro interval: kicks at macro nodes alone."""
         return self.grid == "macro" and self.only_ends
 
     @property
     def only_ends(self) -> bool:
-        """Whether every node is an end of the interval that a copy of the rule spans."""
+        """Whether every node is an end of the interval that a copy of the rule spans: kicks at macro or micro nodes."""
         return all(min(node, 1 - node) <= NODE_TOLERANCE for node in self.rule.nodes)
 
     def in_words(self) -> str:

@@ -334,7 +334,7 @@ def mollified_impulse(num_micro: int, alpha=0.5) -> Scheme:
 
     Order 2 and symmetric at alpha = 1/2, else order 1. Evaluations per macro step: V once; W num_micro per Newton
     iteration as before, and as many again for the average, with their derivative: cheap where W is quadratic, else an
-    exact solve per micro step. See `vmri_jax.schemes.quadrature.mollified`.
+    iteration per micro step. See `vmri_jax.schemes.quadrature.mollified`.
 
     Args:
         num_micro, alpha: as of `explicit_slow`.

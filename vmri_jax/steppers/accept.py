@@ -111,10 +111,10 @@ class Accepted(NamedTuple):
     def of(cls, equations: StepEquations, settings, weights: Weights = NO_WEIGHTS) -> "Accepted":
         """The accepted corrections of a step, from the positions at its start, with the weights of corrections."""
         slow, fast = weights.largest(equations.q_s, equations.q_f)
-        largest = jnp.maximum(slow, fast)
+        either = jnp.maximum(slow, fast)
         # a constraint g(q_s, q_f) carries the round-off of q_f to q_s, and vice versa
-        tied = (largest, largest) if equations.system.constraint is not None else (slow, fast)
-        floors = jnp.stack([slow, tied[0]]), jnp.stack([fast, tied[1]]), largest
+        tied = (either, either) if equations.system.constraint is not None else (slow, fast)
+        floors = jnp.stack([slow, tied[0]]), jnp.stack([fast, tied[1]]), either
         roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in floors)
         return cls(settings.tolerance / SAFETY, *roundoff)
 
@@ -164,7 +164,7 @@ def is_solved(rows, motions):
     return rows <= ROUNDOFF * jnp.finfo(float).eps * jnp.maximum(*motions)
 
 
-def constraint_length(equations: StepEquations, weights: Weights = NO_WEIGHTS):
+def constraint_length(equations: StepEquations, weights: Weights):
     """Largest radius of curvature of the constraints at the start of a step,
     ``max_i |e . grad g_i| / |e^T (hess g_i) e|`` along a direction e.
 

@@ -31,11 +31,11 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import inverse, matmul, max_abs
 from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.structure import curved_directions
-from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.steppers.accept import Accepted, expected
-from vmri_jax.steppers.interval import constant_mass, implicit_terms
+from vmri_jax.steppers.interval import implicit_terms
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated, only_if
@@ -57,7 +57,7 @@ class IntervalEquations:
         self.times = equations.t + self.h * control_nodes(self.r)
         self.form = lagrangian(self.system, equations.scheme).kinetic.fast_form[1:]
         self.potentials = implicit_terms(self.system, equations.scheme)
-        self.mass = constant_mass(self.system).fast_mass
+        self.mass = self.system.kinetic.fast_mass
         self.inverse_mass = self.mass.inverse()
         self.num_slow = num_slow
         directions = curved_directions(partial(self.potential_of_fast, self.q), self.q[num_slow:])
@@ -81,13 +81,9 @@ class IntervalEquations:
         """``M^-1 x`` for (n, m)."""
         return self.inverse_mass.times(x.T).T
 
-    def of_term(self, term: TermOnNodes, q):
-        """A term of the Lagrangian at one point, with its sign."""
-        return term.sign * term.integrand(*({"q_s": self.q_s, "q_f": q}[name] for name in term.arguments))
-
     def potential(self, q):
         """All potentials at one point."""
-        return -sum((self.of_term(term, q) for term in self.potentials), jnp.zeros(()))
+        return -sum((term.sign * term.at(self.q_s, q) for term in self.potentials), jnp.zeros(()))
 
     def potential_of_fast(self, q, fast):
         """`potential` with the fast variables as an argument of their own."""
@@ -118,7 +114,7 @@ class IntervalEquations:
         for term in self.potentials:
             theta = term.inside.theta
             basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
-            gradient = jax.grad(partial(self.of_term, term))
+            gradient = jax.grad(lambda q, term=term: term.sign * term.at(self.q_s, q))
             before, k = int(np.argmax(basis[0, 1:])), len(theta)
             consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
             if np.array_equal(basis, consecutive):  # quadrature nodes are control nodes: no interpolation
@@ -276,11 +272,8 @@ class Collocation(StepSolver):
     num_slow: int
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: tuple) -> tuple[Solution, tuple]:
-        settings, interval, modes = (
-            self.settings,
-            IntervalEquations(equations, self.num_slow),
-            TimeModes.of(equations.scheme),
-        )
+        settings, interval = self.settings, IntervalEquations(equations, self.num_slow)
+        modes = TimeModes.of(equations.scheme)
         x, mu = guess.fast[0].T, guess.multiplier[0].T
         saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
         accepted = Accepted.of(equations, settings)

@@ -1,6 +1,6 @@
 """A composition: its stages one after the other, each over its part of the macro step, some of them backwards."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -43,8 +43,7 @@ class Composed(Stepper):
             (state, last), (c, memory) = carry, coefficient_and_memory
             memory = self.stage.continued(memory, last, state, c * macro_dt)
             end, info, memory = self.stage.step(state, memory, c * macro_dt)
-            # t + c_i H, whatever time a stepper of the user returns
-            return (replace(end, t=state.t + c * macro_dt), memory), (memory, info)
+            return (end, memory), (memory, info)
 
         stages = jnp.asarray(self.coefficients), memory.stages
         (state, last), (stage_memories, infos) = jax.lax.scan(stage, (state, memory.last), stages)

@@ -7,8 +7,8 @@ stride doubles after a success and halves after a part that ends early, by a sin
 up all iterations ends the continuation. Plain iteration and continuation are one loop, compiled once; a step that
 converges at once takes one turn.
 
-The first attempt is the whole step from the prediction of the steps before, the
-second the whole step from straight motion, all further attempts are parts of the step.
+The first attempt is the whole step from the prediction of the steps before, the second the whole step from straight
+motion, all further attempts are parts of the step.
 """
 
 from collections.abc import Callable
@@ -24,6 +24,7 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.constraints import is_rank_deficient
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.results import RUNNING, Result
+from vmri_jax.steppers.solver import iterated
 from vmri_jax.steppers.stepper import StepStatus
 
 SHORTEST_PART = 1 / 64
@@ -100,7 +101,7 @@ def solve_in_parts(
     start = jnp.where(starts_finite(equations), RUNNING, Result.NON_FINITE)  # no attempt after a failed step
     rates = rates_of(guess, equations, 1.0)
     whole = Part(jnp.ones(()), jnp.ones(()), rates, solution, start, jnp.asarray(0), jnp.asarray(0))
-    return jax.lax.while_loop(lambda part: part.result == RUNNING, attempt, whole)
+    return iterated(attempt, whole)
 
 
 def starts_finite(equations: StepEquations):

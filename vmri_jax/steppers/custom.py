@@ -17,20 +17,11 @@ from vmri_jax.steppers.solved import Solved
 from vmri_jax.steppers.stepper import Stepper
 
 
-def whole_step(made: Any, system: System, scheme: Scheme, average: Callable | None) -> Kicked:
-    """The stepper of a run, made of a user's stepper.
+def with_kicks(made: Any, system: System, scheme: Scheme, average: Callable | None) -> Kicked:
+    """The stepper of a run from `made`, the value of ``Solver.stepper``.
 
-    A `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added before and
-    after; any other stepper takes the whole step.
-
-    Args:
-        made: value of ``Solver.stepper``.
-        system: of the run.
-        scheme: of a stage.
-        average: of mollified kicks, see `Kicked`.
-
-    Raises:
-        TypeError: `made` is no stepper.
+    A `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added, mollified ones
+    with their `average`; any other stepper takes the whole step.
     """
     check_type("plan: the value of Solver.stepper", made, Stepper, "a vmri_jax.steppers.stepper.Stepper")
     if isinstance(made, Solved):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.mechanics.state import State
-from vmri_jax.steppers.kicked import Kicked, steps_in_words
+from vmri_jax.steppers.kicked import Kicked, Repeated
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
@@ -31,23 +31,21 @@ class Decoupled(Stepper):
     stepper.
 
     slow: stepper of the slow variables, one step over the macro interval.
-    fast: stepper of the fast variables, `num_fast` steps.
+    fast: steps of the fast variables.
     """
 
     slow: Kicked
-    fast: Kicked
-    num_fast: int
+    fast: Repeated
 
     def init(self, state: State, macro_dt) -> DecoupledMemory:
         slow, fast = apart(state)
-        return DecoupledMemory(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt / self.num_fast))
+        return DecoupledMemory(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt))
 
     def advance(self, state: State, memory: DecoupledMemory, macro_dt) -> tuple[State, StepInfo, DecoupledMemory]:
         slow, fast = apart(state)
         slow, slow_info, slow_memory = self.slow.advance(slow, memory.slow, macro_dt)
-        micro_dt = macro_dt / self.num_fast
-        renewed = self.fast.renew(fast, memory.fast, micro_dt)
-        fast, info, fast_memory = self.fast.advance_many(fast, renewed, micro_dt, self.num_fast)
+        renewed = self.fast.renew(fast, memory.fast, macro_dt)
+        fast, info, fast_memory = self.fast.advance(fast, renewed, macro_dt)
         status = slow_info.status.worse(info.status)
         end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
         info = StepInfo(*status, info.q_f_micro, info.multiplier, slow_info.multiplier[0])
@@ -57,16 +55,12 @@ class Decoupled(Stepper):
         slow, fast = apart(state)
         return DecoupledMemory(
             self.slow.continued(memory.slow, last.slow, slow, macro_dt),
-            self.fast.continued(memory.fast, last.fast, fast, macro_dt / self.num_fast),
+            self.fast.continued(memory.fast, last.fast, fast, macro_dt),
         )
 
     def describe(self) -> list[str]:
-        return [
-            "slow variables, one step:",
-            *indented(self.slow.describe()),
-            f"fast variables, {steps_in_words(self.num_fast, self.fast)}:",
-            *indented(self.fast.describe()),
-        ]
+        steps, *inner = self.fast.describe()
+        return ["slow variables, one step:", *indented(self.slow.describe()), f"fast variables, {steps}", *inner]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.interval import IntervalStructure, Matrix, constant_mass
+from vmri_jax.steppers.interval import IntervalStructure, Matrix
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
@@ -22,7 +22,7 @@ class FreeFlight(Stepper):
     system: System
 
     def advance(self, state: State, memory: tuple, macro_dt) -> tuple[State, StepInfo, tuple]:
-        v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)
+        v_s, v_f = self.system.kinetic.velocity(state.p_s, state.p_f)
         q_s, q_f = state.q_s + macro_dt * v_s, state.q_f + macro_dt * v_f
         info = StepInfo(*StepStatus.direct(Method.EXPLICIT), q_f[None], jnp.zeros((1, 1, 0)), jnp.zeros((1, 0)))
         return State(state.t + macro_dt, q_s, q_f, state.p_s, state.p_f), info, memory

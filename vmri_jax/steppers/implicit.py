@@ -45,7 +45,7 @@ def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x)
     return dz, dx + jnp.sum(matrices.response * march.seen(dz), axis=-1)
 
 
-def _direction(equations: StepEquations, x: Unknowns):
+def newton_direction(equations: StepEquations, x: Unknowns):
     """The map ``residual -> -(dR/dx)^-1 residual``, with the matrix at x as a constant for derivatives."""
     march = MarchEquations(equations)
     z, x_flat = march.flat(x)
@@ -93,7 +93,7 @@ def differentiable(equations: StepEquations, x: Unknowns, end):
 @differentiable.defjvp
 def _implicit_derivative(primals, tangents):
     equations, root, end = primals
-    direction = _direction(equations, root)
+    direction = newton_direction(equations, root)
     # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the
     # equations with the right first derivative. A recursive call of `differentiable` would not do: for reverse mode JAX
     # evaluates the first derivative in part, and this partial evaluation drops the rules of custom derivatives.

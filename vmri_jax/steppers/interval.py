@@ -3,8 +3,9 @@
 K (r n_f, r n_f) is the derivative of the fast momentum equations, times h and without constraint forces, by the fast
 increments. Its rows i = 0..r-1 and columns j = 1..r are
 
-    K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) U''(c_k) + h^2 sum_k w_k l_i(c_k) (dF/dq l_j(c_k) + dF/dv
-    l_j'(c_k) / h) k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
+    K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) U''(c_k)
+           + h^2 sum_k w_k l_i(c_k) (dF/dq l_j(c_k) + dF/dv l_j'(c_k) / h)
+    k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
 
 k_ij has the nodes c_n and weights w_n of T. The terms with U'' are summed over W and all other potentials U with nodes
 c_k inside micro intervals. U'' and the derivatives of the forces F, both in fast variables, are evaluated on the
@@ -28,7 +29,6 @@ from vmri_jax.kernels import DIAGONAL_MATRICES, LARGEST_RENEWED, inverse
 from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.mechanics.constraint_pattern import MOST_ROWS_OF_FULL_MATRIX, fast_rows
-from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
 from vmri_jax.mechanics.system import System
@@ -47,16 +47,9 @@ PATHS = 3
 part of the positions."""
 
 
-def constant_mass(system: System) -> ConstantMass:
-    """The kinetic energy of a system of constant masses, with its type."""
-    assert isinstance(system.kinetic, ConstantMass)
-    return system.kinetic
-
-
 def implicit_terms(system: System, scheme: Scheme) -> list[TermOnNodes]:
     """The potentials with nodes inside micro intervals, whose gradients depend on the fast unknowns."""
-    terms = [term for term in lagrangian(system, scheme).terms if isinstance(term, TermOnNodes)]
-    return [term for term in terms if np.any(term.inside.c > 0)]
+    return [term for term in lagrangian(system, scheme).terms if np.any(term.inside.c > 0)]
 
 
 class DiagonalMatrix(NamedTuple):
@@ -93,15 +86,15 @@ class IntervalStructure:
         sum over the coordinates. K then leaves out forces and potentials that depend on slow variables: this costs
         passes, not accuracy.
     is_constant: whether K is the same for a whole run.
-    curved: sparsity of K, where it is not diagonal.
-    sparsity: of ``G K^-1 G^T``.
+    of_matrix: sparsity of K, where it is not diagonal.
+    of_constraints: sparsity of ``G K^-1 G^T``.
     """
 
     is_explicit: bool
     is_diagonal: bool
     is_constant: bool
-    curved: Sparsity
-    sparsity: Sparsity
+    of_matrix: Sparsity
+    of_constraints: Sparsity
 
     @classmethod
     def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "IntervalStructure":
@@ -111,27 +104,25 @@ class IntervalStructure:
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
         # further potentials may be stiff: K must contain them
         sums = sums and all(term.name in ("V", "W") for term in terms)
-        linear = all(is_linear(partial(t.integrand, q_s) if "q_s" in t.arguments else t.integrand, q_f) for t in terms)
+        linear = all(is_linear(partial(term.at, q_s), q_f) for term in terms)
         linear &= scheme.degree == 1 or q_f.size > SMALL  # few variables and a high degree: one full matrix is cheaper
-        is_diagonal = DIAGONAL_MATRICES and constant_mass(system).fast_mass.is_diagonal and (linear or sums)
+        is_diagonal = DIAGONAL_MATRICES and system.kinetic.fast_mass.is_diagonal and (linear or sums)
         is_explicit = scheme.degree == 1 and not terms and system.force is None
         varies = system.force is not None or (scheme.degree > 1 and system.constraint is not None)
-        q = {"q_s": q_s, "q_f": q_f}
         is_constant = (is_diagonal or not varies) and all(
-            has_constant_hessian(term.integrand, *(q[a] for a in term.arguments))
-            for term in (of_fast if is_diagonal else terms)
+            has_constant_hessian(term.at, q_s, q_f) for term in (of_fast if is_diagonal else terms)
         )
-        full = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
-        sparsity = fast_rows(system, q_s, q_f, scheme.degree) if is_diagonal else full
-        curved = Full(scheme.degree * q_f.size)
+        of_matrix = Full(scheme.degree * q_f.size)
         if not is_diagonal and q_f.size > MOST_ROWS_OF_FULL_MATRIX:
-            curved = _curved(system, scheme, q_s.size, q_f.size)
-        return cls(is_explicit, is_diagonal, is_constant, curved, sparsity)
+            of_matrix = _of_matrix(system, scheme, q_s.size, q_f.size)
+        full = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
+        of_constraints = fast_rows(system, q_s, q_f, scheme.degree) if is_diagonal else full
+        return cls(is_explicit, is_diagonal, is_constant, of_matrix, of_constraints)
 
     @property
     def is_cheap(self) -> bool:
         """Whether every macro step computes K anew: it is small, or no larger than a few vectors."""
-        return self.is_diagonal or isinstance(self.curved, Band) or self.curved.size <= LARGEST_RENEWED
+        return self.is_diagonal or isinstance(self.of_matrix, Band) or self.of_matrix.size <= LARGEST_RENEWED
 
     def no_matrix(self, equations: StepEquations) -> Matrix:
         """K filled with zeros, for its shapes."""
@@ -140,7 +131,7 @@ class IntervalStructure:
     @partial(jax.jit, static_argnums=0)  # traced once for the shapes of `no_matrix` and for the steps
     def matrix(self, equations: StepEquations) -> Matrix:
         """K on the first micro interval of a macro step, on the straight path from its start."""
-        velocities = constant_mass(equations.system).velocity(equations.p_s, equations.p_f)
+        velocities = equations.system.kinetic.velocity(equations.p_s, equations.p_f)
         c, lengths = control_nodes(equations.scheme.degree)[1:, None], (equations.macro_dt, equations.micro_dt)
         slow, fast = (length * c * v for length, v in zip(lengths, velocities, strict=True))
         intervals = Intervals(equations)
@@ -148,9 +139,9 @@ class IntervalStructure:
         if self.is_diagonal:
             return _diagonal_matrix(intervals, path)
         times_k = jax.linearize(partial(_rows, intervals, path), fast)[1]
-        seeds = self.curved.seeds
+        seeds = self.of_matrix.seeds
         products = jax.vmap(times_k)(seeds.reshape(len(seeds), *fast.shape))
-        return JoinedMatrix(self.curved.inverse(products.reshape(seeds.shape), may_depend=False))
+        return JoinedMatrix(self.of_matrix.inverse(products.reshape(seeds.shape), may_depend=False))
 
 
 def _rows(intervals: Intervals, path: IntervalPath, fast):
@@ -160,7 +151,7 @@ def _rows(intervals: Intervals, path: IntervalPath, fast):
     return intervals.rows(intervals.with_inertia(d, fast))
 
 
-def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
+def _of_matrix(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
     """Sparsity of K: the rows that change with each fast coordinate on random paths.
 
     An entry that differs from zero elsewhere alone is missed, which costs passes, not accuracy.
@@ -196,7 +187,6 @@ def _touched(parts: tuple[System, Scheme], numbers, fast):
 
 def _diagonal_matrix(intervals: Intervals, path: IntervalPath) -> DiagonalMatrix:
     equations, kinetic = intervals.equations, intervals.kinetic
-    assert kinetic is not None
     # block_ija = k_ij M_a - h^2 sum_k w_k l_i(c_k) l_j(c_k) W''_aa, i = 0..r-1, j = 1..r, coordinate a
     block = kinetic.fast_form[:-1, 1:, None] * kinetic.mass.fast
     for term, nodes in intervals.terms:

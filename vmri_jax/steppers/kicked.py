@@ -119,7 +119,8 @@ class Kicked(Stepper):
 
 @dataclass(frozen=True)
 class Repeated(Stepper):
-    """`count` shorter steps of a kicked stepper, between two kicks of a potential with a longer interval."""
+    """`count` shorter steps of a kicked stepper: those of the fast variables in a macro step, or the steps between two
+    kicks of a potential with a longer interval."""
 
     inner: Kicked
     count: int
@@ -137,12 +138,9 @@ class Repeated(Stepper):
         return self.inner.continued(memory, last, state, macro_dt / self.count)
 
     def describe(self) -> list[str]:
-        return [f"{steps_in_words(self.count, self.inner)}:", *indented(self.inner.describe())]
-
-
-def steps_in_words(count: int, stepper: Kicked) -> str:
-    """The number of steps of a stepper in words; "micro steps" if it has no shorter steps inside."""
-    return f"{count} {'' if isinstance(stepper.inner, Repeated) else 'micro '}step{'s' * (count > 1)}"
+        are_micro = not isinstance(self.inner.inner, Repeated)  # no shorter steps inside
+        steps = f"{self.count} {'micro ' * are_micro}step{'s' * (self.count > 1)}:"
+        return [steps, *indented(self.inner.describe())]
 
 
 def _all_steps(before, last):

@@ -147,16 +147,13 @@ class MarchEquations:
 
     def interval(self, m, x, arriving: FlatArriving, slow):
         """Residual (k,) of interval m, and the gradients (o,) that it hands on."""
-        residual, on = self.intervals.evaluate(m, self._named(x), self._apart(arriving), self._by_node(slow))
+        residual, on = self.intervals.evaluate(m, self._named(x), self._apart(arriving), slow.reshape(self.r, self.n_v))
         rows = jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)])
         return rows, _gradients(on)
 
     def _named(self, x) -> IntervalUnknowns:
         fast, multiplier = split_at(x, self.num_fast)
         return IntervalUnknowns(fast.reshape(self.r, self.n_f), multiplier.reshape(self.r, self.n_g))
-
-    def _by_node(self, slow):
-        return slow.reshape(self.r, self.n_v)
 
     def slow_equations(self, z, arriving: FlatArriving):
         """Residual (b,) of the slow equations, and the slow momentum at the end."""
@@ -219,7 +216,7 @@ class MarchEquations:
         gradients += matvec(hands_on[:, :n], d[:n])
         if self.n_g:
             dmu = self._named(d).multiplier
-            named = self._named(x), self._apart(arriving), self._by_node(slow)
+            named = self._named(x), self._apart(arriving), slow.reshape(self.r, self.n_v)
             gradients += _gradients(self.intervals.impulses(m, *named, dmu))
         worst = worst.add(residual, d, largest(residual[:n], self.of_momenta.fast), self.fast_size(d))
         return x + d, FlatArriving(arriving.position + self.last_increment(x + d), gradients), worst

@@ -78,7 +78,7 @@ class Marched(StepSolver):
     """
 
     settings: Solver
-    sizes: tuple[int, int, int, int, int] | None = None
+    sizes: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
 
     def init(self, equations: StepEquations) -> MarchMemory:
         march = self._march(equations, NO_WEIGHTS)
@@ -121,10 +121,6 @@ class Marched(StepSolver):
     def is_exact(self) -> bool:
         return self.settings.matrix != "masses"
 
-    @property
-    def _has_multipliers(self) -> bool:
-        return self.settings.matrix != "null_space"
-
     def _pass(self, march: MarchEquations, renews, last: Progress, start) -> tuple[Matrices, Passed]:
         """A pass from `start`, the unknowns as in `linearised_pass`, with new matrices if `renews`, else with the last
         ones."""
@@ -148,7 +144,8 @@ class Marched(StepSolver):
         return progress._replace(matrices=matrices, rate=jnp.where(renews, 0.0, progress.rate))
 
     def _march(self, equations: StepEquations, weights: Weights) -> MarchEquations:
-        inverted = inverse_with_multipliers if self._has_multipliers else inverse_without_multipliers
+        is_null_space = self.settings.matrix == "null_space"
+        inverted = inverse_without_multipliers if is_null_space else inverse_with_multipliers
         return MarchEquations(equations, inverted, weights)
 
     def _iterate(
@@ -235,11 +232,9 @@ class Marched(StepSolver):
     def describe(self) -> list[str]:
         if not self.is_exact:
             return ["masses: micro intervals in order with matrices of the masses at the start of the step"]
-        if self._has_multipliers:
+        if self.settings.matrix == "exact":
             return ["exact: micro intervals in order with exact matrices"]
         head = "null_space: micro intervals in order with exact matrices, without multipliers"
-        if self.sizes is None:
-            return [head]
         *counts, r = self.sizes
         parts = zip(("slow variables", "each micro interval"), counts[::2], counts[1::2], strict=True)
         unknowns = [f"  unknowns of {part}: {r * (n - g)}, with multipliers {r * (n + g)}" for part, n, g in parts if g]

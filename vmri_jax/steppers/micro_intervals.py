@@ -12,7 +12,7 @@ from vmri_jax.kernels.band import BandInverse, FullInverse
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import IntervalStructure, Matrix, constant_mass
+from vmri_jax.steppers.interval import IntervalStructure, Matrix
 from vmri_jax.steppers.solver import only_if
 
 
@@ -45,9 +45,9 @@ class MicroSweep(NamedTuple):
     scale: Float[Numbers, "num_micro r 1"]
     multiplier: Float[Array, "r n_g"]
 
-    def unsolved(self) -> FastUnknowns:
+    def blank(self) -> FastUnknowns:
         """The fast unknowns before the first pass."""
-        equations, sparsity = self.intervals.equations, self.structure.sparsity
+        equations, sparsity = self.intervals.equations, self.structure.of_constraints
         schur_inverse = jax.eval_shape(sparsity.inverse, sparsity.seeds)
         increments = jnp.zeros((equations.scheme.degree, equations.q_f.size))
         of_interval = FastUnknowns(increments, jnp.zeros_like(self.multiplier), schur_inverse)
@@ -67,7 +67,7 @@ class MicroSweep(NamedTuple):
             increment.
         """
         equations, r = self.intervals.equations, self.intervals.equations.scheme.degree
-        velocity = constant_mass(equations.system).fast_mass.inverse().times
+        velocity = equations.system.kinetic.fast_mass.inverse().times
         seen = self.intervals.seen.take(slow)
 
         def interval(carry, numbers):
@@ -120,7 +120,7 @@ class MicroSweep(NamedTuple):
             g, push = jax.linearize(lambda x: intervals.constraints(path._replace(fast=x), m, slice(1, None)), x + dx)
 
             def schur_inverse(_):
-                sparsity = self.structure.sparsity
+                sparsity = self.structure.of_constraints
                 seeds = sparsity.seeds
                 columns = jax.vmap(lambda seed: push(solve(intervals.rows(pull(seed)))))(seeds.reshape(-1, *mu.shape))
                 return sparsity.inverse(columns.reshape(seeds.shape))

@@ -28,11 +28,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import LINEARISES_FORCES, max_abs
+from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
-from vmri_jax.steppers.interval import IntervalStructure, Matrix, constant_mass
+from vmri_jax.steppers.interval import IntervalStructure, Matrix
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method
@@ -94,6 +95,11 @@ class Pass(NamedTuple):
     passes: Int[Array, ""]
     result: Int[Array, ""]
 
+    @property
+    def unknowns(self) -> Unknowns:
+        """The unknowns of the step."""
+        return Unknowns(self.slow, self.slow_multiplier, self.fast.increments, self.fast.multiplier)
+
 
 @dataclass(frozen=True)
 class Nested(StepSolver):
@@ -135,7 +141,7 @@ class Nested(StepSolver):
         passes = _Passes(memory, sweep, self.settings)
         done = iterated(passes.next, passes.start())
 
-        x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
+        x = done.unknowns
         end = done.end.q_f, done.p_s, done.end.p_f / equations.micro_dt
         status = status_of(equations, done.result, Method.MASSES, done.passes, rows=done.rows, end=end)
 
@@ -170,7 +176,7 @@ class _Passes:
         self.equations = equations = sweep.intervals.equations
         self.slow_equations = SlowEquations.of(sweep.intervals)
         self.accepted = Accepted.of(equations, settings)
-        self.mass = constant_mass(equations.system)
+        self.mass = equations.system.kinetic
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
         self.num_multipliers = equations.system.num_constraints(equations.q_s, equations.q_f)[1]
 
@@ -179,9 +185,11 @@ class _Passes:
         hidden constraints, from straight motion."""
         increment = self.equations.macro_dt * self.mass.slow_mass.inverse().times(self.equations.p_s)
         straight = (control_nodes(self.r)[1:, None] * increment).reshape(-1)
-        slow = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
-        z, fast, zero = self._apart(slow), self.sweep.unsolved(), jnp.zeros(())
-        inertia = ConstraintInertia.none(self.memory.multiplier.size, z[0])
+        predicted = self.memory.slow.next(straight.size, jnp.pad(straight, (0, self.r * self.num_multipliers)))
+        slow, multiplier = split_at(predicted, straight.size)
+        z = slow.reshape(self.r, self.n_s), multiplier.reshape(self.r, self.num_multipliers)
+        fast, zero = self.sweep.blank(), jnp.zeros(())
+        inertia = ConstraintInertia(*2 * [jnp.zeros((self.memory.multiplier.size, self.r, self.n_s))])  # none yet
         none, error = jnp.zeros(self.r * self.n_s), self.memory.slow_model_error
         numbers = zero, jnp.asarray(0), jnp.asarray(RUNNING)
         return Pass(*z, fast, self.sweep.intervals.start(), zero, none, inertia, error, self.equations.p_s, *numbers)
@@ -200,8 +208,7 @@ class _Passes:
             still_missing * self.accepted.ratio((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
         )
         wanted = jnp.where(is_hard, last.d, 0.0)  # in lanes of a batch without a hard step the loop ends at once
-        x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
-        d = only_if(is_hard, lambda _: self.slow_equations.with_forces(wanted, x), last.d)
+        d = only_if(is_hard, lambda _: self.slow_equations.with_forces(wanted, last.unknowns), last.d)
         now = self._moved_by(d, last)
         missing, update = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
         error = max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny)
@@ -238,8 +245,3 @@ class _Passes:
             passes=passes,
             result=self.settings.status(ratio, passes),
         )
-
-    def _apart(self, z):
-        """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""
-        size = self.r * self.n_s
-        return z[:size].reshape(self.r, self.n_s), z[size:].reshape(self.r, -1)

@@ -35,7 +35,7 @@ from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
-from vmri_jax.steppers.custom import check_shapes, whole_step
+from vmri_jax.steppers.custom import check_shapes, with_kicks
 from vmri_jax.steppers.decoupled import Decoupled, Joined
 from vmri_jax.steppers.direct import FreeFlight, Linear
 from vmri_jax.steppers.interval import SMALL, IntervalStructure, implicit_terms
@@ -46,7 +46,7 @@ from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Solved, StepSolver
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
-from vmri_jax.steppers.subsystems import fast_part, frozen_slow, joined, slow_part
+from vmri_jax.steppers.subsystems import frozen_slow, joined, part_alone
 
 Parts = tuple[list[PlacedTerm], dict[int, list[PlacedTerm]]]
 """Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals
@@ -133,7 +133,7 @@ def plan(
     if solver.stepper is None or isinstance(custom, StepSolver):
         stepper: Stepper = _whole_step(system, stage, solver, state.q_s, state.q_f)
     else:
-        stepper = whole_step(custom, system, stage, _average(system, stage, Solver()))
+        stepper = with_kicks(custom, system, stage, _average(system, stage, Solver()))
     if solver.stepper is not None:
         check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):
@@ -278,20 +278,15 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
         term, rule = potential
         if rule.only_kicks:
             continue
-
-        def value(q_s, q_f, term=term):
-            return term(system.params, q_s=q_s, q_f=q_f)
-
+        sees_slow, sees_fast = depends_on(lambda *q, term=term: term.at(q, system.params), q_s, q_f)
         if rule.grid == "macro":
-            if term.name == "W" or depends_on(partial(value, q_s), q_f)[0]:
+            if term.name == "W" or sees_fast:
                 return None
             slow.append(potential)
         elif term.name == "V" and rule.every == 1:
             return None
         else:
-            may_see_slow = "q_s" in term.arguments and q_s.size > 0
-            sees_slow = may_see_slow and depends_on(partial(value, q_f=q_f), q_s)[0]
-            if sees_slow or (rule.every > 1 and not rule.only_ends):
+            if (sees_slow and q_s.size) or (rule.every > 1 and not rule.only_ends):
                 return None
             fast.setdefault(rule.every, []).append(potential)
     fast = dict(sorted(fast.items()))
@@ -302,13 +297,13 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
 
 def _decoupled(system: System, scheme: Scheme, solver: Solver, q_s, q_f, potentials: Parts) -> Decoupled:
     (of_slow, of_fast), none = potentials, jnp.zeros(0)
-    slow, slow_scheme = slow_part(system, of_slow, num_fast=q_f.size)
-    parts = {every: fast_part(system, further, num_slow=q_s.size) for every, further in of_fast.items()}
+    slow, slow_scheme = part_alone(system, "slow", of_slow, num_other=q_f.size)
+    parts = {every: part_alone(system, "fast", further, num_other=q_s.size) for every, further in of_fast.items()}
     fast, length = _whole_step(*parts.pop(1), solver, none, q_f), 1
     for every, part in parts.items():
         fast = Kicked(lagrangian(*part).kicks, Repeated(fast, every // length))
         length = every
-    return Decoupled(_whole_step(slow, slow_scheme, solver, none, q_s), fast, scheme.num_micro // length)
+    return Decoupled(_whole_step(slow, slow_scheme, solver, none, q_s), Repeated(fast, scheme.num_micro // length))
 
 
 def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Composition:

@@ -21,7 +21,6 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import Accepted
-from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated
@@ -57,7 +56,7 @@ class Rattle(StepSolver):
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: RattleMemory) -> tuple[Solution, RattleMemory]:
         system, h, q, settings = equations.system, equations.macro_dt, equations.q_f, self.settings
-        move_by = constant_mass(system).fast_mass.inverse().times  # M^-1
+        move_by = system.kinetic.fast_mass.inverse().times  # M^-1
 
         def constraints(t, q):
             return system.g(t, equations.q_s, q)

@@ -35,11 +35,10 @@ from vmri_jax.kernels import inverse, matmul, max_abs, solve
 from vmri_jax.kernels.band import BandInverse, FullInverse
 from vmri_jax.kernels.saddle import regularized
 from vmri_jax.schemes.discrete_lagrangian import placed_potentials
-from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
+from vmri_jax.schemes.equations import Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import gauss
-from vmri_jax.steppers.interval import constant_mass
 
 NODES = 4
 """Gauss nodes per macro step at which the slow forces are linearised. A larger number makes the solve dearer; with a
@@ -63,11 +62,6 @@ class ConstraintInertia(NamedTuple):
     responses: Float[Array, "r*n_g r n_s"]
     multipliers: Float[Array, "r*n_g r n_s"]
 
-    @classmethod
-    def none(cls, num_rows: int, slow) -> "ConstraintInertia":
-        """Of no tied masses, for r n_g rows and slow increments (r, n_s)."""
-        return cls(*2 * [jnp.zeros((num_rows, *slow.shape))])
-
 
 class SlowEquations(NamedTuple):
     """The slow equations, with ``K_s^-1`` as the Kronecker product of a matrix for the nodes and an operator for the
@@ -85,18 +79,13 @@ class SlowEquations(NamedTuple):
     def of(cls, intervals: Intervals) -> "SlowEquations":
         """The slow equations of a macro step."""
         equations, kinetic = intervals.equations, intervals.kinetic
-        assert kinetic is not None
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
-        return cls(intervals, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
-
-    @property
-    def equations(self) -> StepEquations:
-        """Of the macro step."""
-        return self.intervals.equations
+        return cls(intervals, inverse_form, equations.system.kinetic.slow_mass.inverse().times)
 
     def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia:
         """U and P from the matrix S (r n_g, r n_g) of the first micro interval, with constraints."""
-        equations, r, n_s = self.equations, self.equations.scheme.degree, self.equations.q_s.shape[0]
+        equations = self.intervals.equations
+        r, n_s = equations.scheme.degree, equations.q_s.shape[0]
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
         # keeps round-off independent of the expression of the constraint
         jacobian = jax.lax.optimization_barrier(jacobian)
@@ -125,7 +114,8 @@ class SlowEquations(NamedTuple):
             arriving: quantities that the last micro interval hands on.
             inertia: of the tied masses.
         """
-        equations, n, r = self.equations, self.equations.scheme.num_micro, self.equations.scheme.degree
+        equations = self.intervals.equations
+        n, r = equations.scheme.num_micro, equations.scheme.degree
         times = equations.t + equations.macro_dt * control_nodes(r)[:-1]
         g, push = jax.linearize(self.intervals.slow_constraints, slow)
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow[:-1]])
@@ -154,8 +144,8 @@ class SlowEquations(NamedTuple):
             d: (r n_s,) update by the masses alone.
             x: unknowns, which give the path.
         """
-        equations, H, r, n = self.equations, self.equations.macro_dt, len(x.slow), len(x.fast)
-        system = equations.system
+        equations, r, n = self.intervals.equations, len(x.slow), len(x.fast)
+        system, H = equations.system, equations.macro_dt
         placed = (part for part in placed_potentials(system, equations.scheme) if "q_s" in part.term.arguments)
         potentials = [part.term for part in placed if not part.rule.only_kicks]
         rule = gauss(min(n, NODES))

@@ -120,7 +120,7 @@ class Solved(Stepper):
 
     def advance(self, state: State, memory: SolvedMemory, macro_dt) -> tuple[State, StepInfo, SolvedMemory]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt, memory.last_dt)
-        # no derivative enters the iteration; `derivative` attaches the one of the root
+        # no derivative enters the iteration; `differentiable` attaches the derivative of the root
         solution, solver = self._solve(*jax.lax.stop_gradient((equations, memory)))
         root, status = checkpoint_name(((solution.x, solution.end), solution.status), ROOT)
         x, (q_f, p_s, p_f) = differentiable(equations, *root)
@@ -145,7 +145,7 @@ class Solved(Stepper):
             _, _, v_s, v_f, masses = project_momentum(system, state, sparsity=self.sparsity)
         else:
             velocities, masses = velocity_and_masses(system, *phase)
-            is_first = equations.before == 0
+            is_first = equations.last_dt == 0
             v_s, v_f = jax.tree.map(partial(jnp.where, is_first), velocities, memory.velocity)
         guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)

@@ -20,10 +20,6 @@ structure allows: "modes" with at most 24 variables in an interval, unless W is 
 (`prepare`), the lane (batches), or the piece that failed and all pieces after it (`simulate`, `stream`); see
 `vmri_jax.running.engine`. ``print(vm.plan(problem, scheme))`` says beforehand which matrix a step takes,
 ``StepInfo.method`` and ``Trajectory.info.method`` afterwards.
-
-An iteration ends if its next correction is below a tenth of the tolerance times the motion (of slow variables over the
-macro step, of fast variables over a micro step) plus the round-off of the positions: the formula is in
-`vmri_jax.steppers.accept`.
 """
 
 from dataclasses import replace
@@ -51,7 +47,8 @@ class Solver(eqx.Module):
         matrix: Newton matrix. "auto", the first one that the structure allows, and "exact" for what it does not solve;
             or "masses", "modes", "exact", "null_space" alone.
         tolerance: the iteration ends when the next correction is below ``tolerance / 10 * max |increments|`` plus the
-            round-off of the positions, for slow and for fast variables each (`vmri_jax.steppers.accept`). A saved node
+            round-off of the positions, for slow variables (increments over the macro step) and for fast ones (over a
+            micro step) each, see `vmri_jax.steppers.accept`. A saved node
             fails if the value of a constraint is above ``max(1e-6, 100 tolerance)`` of its size
             (`vmri_jax.mechanics.constraints`).
         max_iterations: a step that needs more iterations has failed; of "masses" and "exact" the passes count.

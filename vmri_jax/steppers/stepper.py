@@ -24,8 +24,9 @@ class StepInfo(eqx.Module):
         "masses" and "exact" estimate R after their last correction, a drift takes the next impulse of the constraints,
         "modes" evaluates it.
     q_f_micro: fast positions at the micro nodes, the start excluded.
-    multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with r the degree of the scheme. A
-        composition of s stages joins those of its stages: ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.
+    multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with num_micro and the degree r of the
+        scheme. A composition of s stages of this scheme joins the multipliers of its stages:
+        ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.
     """
 
     result: Int[Numbers, ""]

@@ -8,6 +8,7 @@ The functions of these systems are dataclasses. They compare by value, so that J
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,7 +22,6 @@ from vmri_jax.mechanics.terms import KINDS, POSITIONS, Term
 from vmri_jax.schemes.discrete_lagrangian import PlacedTerm, placed_potentials
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.interval import constant_mass
 
 
 @dataclass(frozen=True)
@@ -29,62 +29,49 @@ class OfPart:
     """A term that depends on one part alone, as a function of the fast variables of that part, with the time first if
     it is a constraint.
 
-    part, other: names of the positions of the part and of all others.
+    positions, other: names of the positions of the part and of all others.
     num_other: number of the others, which the term gets as zeros.
     """
 
     term: Term
-    part: str
+    positions: str
     other: str
     num_other: int
 
     def __call__(self, *arguments):
         *_, q, params = arguments
-        return self.term(params, **{"t": arguments[0], self.part: q, self.other: jnp.zeros(self.num_other)})
+        return self.term(params, **{"t": arguments[0], self.positions: q, self.other: jnp.zeros(self.num_other)})
 
 
-def slow_part(system: System, potentials: Sequence[PlacedTerm], num_fast: int) -> tuple[System, Scheme]:
-    """The system of the slow variables, and the scheme of their step over the macro interval.
-
-    Args:
-        system: the whole one.
-        potentials: of slow variables alone, with nodes inside the macro interval.
-        num_fast: number of fast variables of the whole system.
-    """
-    return _part(system, ("q_s", "q_f", num_fast), constant_mass(system).slow, "slow_constraint", potentials)
-
-
-def fast_part(system: System, potentials: Sequence[PlacedTerm], num_slow: int) -> tuple[System, Scheme]:
-    """The system of the fast variables, and the scheme of a step of k micro intervals.
+def part_alone(system: System, part: str, potentials: Sequence[PlacedTerm], num_other: int) -> tuple[System, Scheme]:
+    """The system of the slow or of the fast variables, and the scheme of a step: of slow variables over the macro
+    interval, of fast ones over the k micro intervals that the rules of the potentials span.
 
     Args:
         system: the whole one.
-        potentials: of fast variables alone whose rules span k micro intervals.
-        num_slow: number of slow variables of the whole system.
+        part: "slow" or "fast".
+        potentials: of the variables of the part alone; W, or else V, becomes the fast potential of the new system.
+        num_other: number of all other variables.
     """
-    return _part(system, ("q_f", "q_s", num_slow), constant_mass(system).fast, "constraint", potentials)
-
-
-def _part(
-    system: System, positions: tuple[str, str, int], mass, constraint: str, potentials: Sequence[PlacedTerm]
-) -> tuple[System, Scheme]:
-    """A part with its masses and the constraint of this field, and its scheme; W, or else V, is its fast potential."""
-    main = next((part for name in ("W", "V") for part in potentials if part.term.name == name), None)
-    further = {part.term.label: part for part in potentials if part is not main}
+    constraint = "slow_constraint" if part == "slow" else "constraint"
+    positions, other = POSITIONS if part == "slow" else POSITIONS[::-1]
+    alone = partial(OfPart, positions=positions, other=other, num_other=num_other)
+    main = next((placed for name in ("W", "V") for placed in potentials if placed.term.name == name), None)
+    further = {placed.term.label: placed for placed in potentials if placed is not main}
     if "V" in further:  # beside W a potential must not be called V, nor as any other one
         further["V beside " + ", ".join(further)] = further.pop("V")
-    rows = (Rheonomic(OfPart(term, *positions)) for term in system.terms if term.field == constraint)
-    alone = System(
-        ConstantMass(jnp.zeros(0), mass),
-        fast_potential=None if main is None else OfPart(main.term, *positions),
+    rows = (Rheonomic(alone(term)) for term in system.terms if term.field == constraint)
+    of_part = System(
+        ConstantMass(jnp.zeros(0), getattr(system.kinetic, part)),
+        fast_potential=None if main is None else alone(main.term),
         constraint=next(rows, None),
         params=system.params,
-        potentials={name: OfPart(part.term, *positions) for name, part in further.items()},
+        potentials={name: alone(term) for name, (term, _) in further.items()},
     )
     drift = micro(midpoint)
     fast = drift if main is None else replace(main.rule, grid="micro", every=1)
-    rules = {name: micro(part.rule.rule) for name, part in further.items()}
-    return alone, Scheme(1, kinetic=drift, slow=drift, fast=fast, potentials=rules)
+    rules = {name: micro(placed.rule) for name, (_, placed) in further.items()}
+    return of_part, Scheme(1, kinetic=drift, slow=drift, fast=fast, potentials=rules)
 
 
 @dataclass(frozen=True)
@@ -135,7 +122,7 @@ def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Schem
     if system.is_constrained:
         functions["constraint"] = Rheonomic(OfJoined(system.of_kind("constraint"), ("t", *POSITIONS), num_slow))
     if system.has_constant_mass:
-        masses = constant_mass(system)
+        masses = system.kinetic
         kinetic = ConstantMass(jnp.zeros(0), jnp.concatenate(masses.diagonal) if masses.is_diagonal else masses.matrix)
     else:
         kinetic = OfJoined(system.of_kind("kinetic"), KINDS["kinetic"].arguments, num_slow)
@@ -166,6 +153,6 @@ def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     functions: dict[str, Any] = {
         term.field: AtRest(term) for term in system.terms if term.field in ("fast_potential", "constraint")
     }
-    alone = System(ConstantMass(jnp.zeros(0), constant_mass(system).fast), **functions, params=(system.params, q_s))
+    alone = System(ConstantMass(jnp.zeros(0), system.kinetic.fast), **functions, params=(system.params, q_s))
     rule = micro(scheme.kinetic.rule)
     return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)

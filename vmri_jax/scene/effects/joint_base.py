@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, numbers_of, real_array
-from vmri_jax.mechanics.constraints import START
+from vmri_jax.mechanics.constraints import START_TOLERANCE
 from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
@@ -195,7 +195,7 @@ class Joint(Effect):
             if not is_concrete(points):
                 continue
             distance = np.linalg.norm(points[1] - points[0])
-            coincide = distance <= START * max(np.max(np.abs(points[0])), 1.0)
+            coincide = distance <= START_TOLERANCE * max(np.max(np.abs(points[0])), 1.0)
             first, second = (f"{label_of(name)} is at {np.asarray(p)}" for name, p in zip((a, b), points, strict=True))
             expected = f"{first} and {second}; they must coincide at the start"
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)

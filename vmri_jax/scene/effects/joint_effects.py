@@ -10,7 +10,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import library, real_array
 from vmri_jax.mechanics.checks import describe, shape_of
-from vmri_jax.mechanics.constraints import START
+from vmri_jax.mechanics.constraints import START_TOLERANCE
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES
@@ -222,7 +222,7 @@ class JointMotion(InJoint):
     def check_parameters(self):
         super().check_parameters()
         start = self.path(np.zeros(()), self.parameters["path"])
-        self.require(abs(library(start).asarray(start)) < START, "path(0)", start, "the joint starts at zero")
+        self.require(abs(library(start).asarray(start)) < START_TOLERANCE, "path(0)", start, "the joint starts at zero")
 
 
 def equation(law, q, params):

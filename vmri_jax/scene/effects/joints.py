@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
-from vmri_jax.mechanics.constraints import START
+from vmri_jax.mechanics.constraints import START_TOLERANCE
 from vmri_jax.scene.declare import number
 from vmri_jax.scene.effects.joint_base import FREEDOMS, GAP, PARALLEL, AboutAxis, Joint
 from vmri_jax.scene.products import products
@@ -75,7 +75,7 @@ class Universal(AboutAxis):
     def triads(self):
         first, second = self._directions("axis"), self._directions("second")
         product, xp = (first * second).sum(axis=-1), library(first, second)
-        self.require(abs(product) < START, "axis . second", product, "the axes must be perpendicular")
+        self.require(abs(product) < START_TOLERANCE, "axis . second", product, "the axes must be perpendicular")
         return [xp.stack([m, xp.cross(n, m), n]) for n, m in zip(first, second, strict=True)]
 
 
