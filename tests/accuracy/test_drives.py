@@ -116,6 +116,24 @@ def test_steps_over_a_pulse_are_not_certified():
     assert smaller.error.largest == pytest.approx(true, rel=0.1)  # 0.2 % measured
 
 
+def test_errors_of_driven_runs_keep_their_signs():
+    """The third companion has every twentieth node in common: nodes between these have errors of their own."""
+    problem, scheme = oscillator(SINE, 0.0, 0.7, 1.0), vm.fully_explicit(1)
+    run = vm.simulate(problem, scheme, macro_dt=0.1, t_end=LENGTH, error=lambda run: run.q_s[:, 0])
+    true = run.q_s[:, 0] - motion(np.asarray(run.t), problem.system.params)
+    for error in (run.error.q_s[:, 0], run.error.of):
+        np.testing.assert_allclose(error, true, atol=0.05 * np.abs(true).max())  # 0.01 measured
+    shares = vm.simulate(problem, scheme, macro_dt=0.1, t_end=LENGTH, error="shares").error
+    slow = np.abs(np.abs(true) - np.multiply.outer((1, -1), shares.fast))  # of equal and of opposite signs
+    assert np.abs(slow - shares.slow).min(axis=0).max() <= 0.05 * np.abs(true).max()  # 0.01 measured
+
+
+def test_errors_of_functions_know_jumps():
+    problem, scheme = oscillator(STEP, 3.777, 1.0, 1.0), vm.fully_explicit(1)
+    run = vm.simulate(problem, scheme, macro_dt=0.1, t_end=LENGTH, error=lambda run: run.q_s[:, 0])
+    assert np.abs(run.error.of).max() == pytest.approx(run.error.largest)
+
+
 def test_events_demand_many_steps(monkeypatch):
     monkeypatch.setattr("vmri_jax.accuracy.search.MANY_STEPS", 100)
     with pytest.warns(UserWarning, match="force of the system changes and changes back within 0.03"):

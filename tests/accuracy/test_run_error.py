@@ -123,6 +123,7 @@ def test_parts_and_files(tmp_path):
     dataset = run.to_xarray()
     np.testing.assert_array_equal(dataset["error_q_f"], run.error.q_f)
     assert jax.tree.map(lambda a: a, run).error.is_certified
+    assert "q_s" in repr(jax.eval_shape(lambda error: error, run.error))
 
 
 def double_pendulum() -> vm.Problem:

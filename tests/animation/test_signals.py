@@ -80,6 +80,8 @@ def test_bodies_at_rest_have_no_curves():
     assert slow_signal(still) is None
     assert fast_signal(still) is None
     assert not [panel for panel in plot_strip(still, 2).axes if panel.lines]
+    failed = run.with_arrays(q_s=np.where(run.t[:, None] > run.t[0], np.nan, run.q_s))  # in its first step
+    assert fast_signal(motion(failed, Drawing.from_dict(DRAWING))) is None
 
 
 @pytest.mark.parametrize("theme", [plots.LIGHT, plots.DARK])

@@ -143,6 +143,9 @@ def test_axes_and_files_are_seen_from_the_folder(tmp_path):
     [
         (("out =", "oout ="), "no entry 'oout'. Did you mean out?"),
         (('system = "fpu"\n', ""), "lacks the entry 'system'"),
+        (('system = "fpu"\n', "system = 3\n"), 'system is int; give "fpu"'),
+        (("[axes]\nomega = [20.0, 50.0]", "axes = 3"), "axes is int; give [axes]"),
+        (("omega = [20.0, 50.0]", "num_micro = [1, 'a']"), "the column 'num_micro' has labels; give numbers"),
         (("omega = [20.0, 50.0]", "omega = { from = 1 }"), "the axis omega lacks the entry 'to'"),
         (("omega = [20.0, 50.0]", "omega = { values = [1], from = 1 }"), "the axis omega: there is no entry 'from'"),
         (("omega = [20.0, 50.0]", "omega = { from = 1, to = 2, count = 3.7 }"), "the axis omega: count is 3.7"),

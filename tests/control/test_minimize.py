@@ -39,7 +39,8 @@ def least(steps: int = 20, goal=at_rest_at_one, **asked):
 
 
 def test_a_double_integrator():
-    """u = 6 - 12 t, J = 6, multipliers (-12, 6), and one iteration, since the problem is linear."""
+    """u = 6 - 12 t, J = 6 and one iteration, since the problem is linear; the multipliers (-12, 6) are minus the
+    derivatives of ``J = 6 x^2 - 6 x p + 2 p^2`` with respect to the position x and the momentum p of the goal."""
     optimum = least()
     assert optimum.success
     assert optimum.iterations <= 2

@@ -101,6 +101,7 @@ def test_unique_rows():
         ),
         (lambda: Draws(5, {"a": ("uniform", 1, 0)}), r"takes? the lowest and the highest value|gives no numbers"),
         (lambda: Draws(5, {"a": ("uniform", 1)}), r"uniform with the arguments \(1\.0,\)"),
+        (lambda: Draws(5, {"a": ("normal", 0.0, "1")}), r"the column 'a' is \(0\.0, '1'\); give real numbers"),
         (lambda: Draws(5, {"a": 3.0}), r"the column 'a' is 3\.0; give a distribution"),
         (lambda: Draws(5, {"a": ("uniform", 0, 1)}, method="sobel"), r"Did you mean sobol\?"),
         (lambda: Draws(2**23, {"a": ("uniform", 0, 1)}, method="latin-hypercube"), r"take method='random'"),

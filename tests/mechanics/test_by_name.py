@@ -159,6 +159,7 @@ def unknown_force(t, q_s, q_f, v_s, v_f, params):
         ({"q_s": [0.0]}, "masses by name, trolley, but the slow coordinates are a vector"),
         ({"q_s": [0.0], "v_s": {"trolley": 0.0}}, "v_s is a dictionary and q_s is none"),
         ({"system": CRANE_BY_NAME.replace(fast_potential=misspelt)}, "'laod' is not there; q_s has trolley and q_f"),
+        ({"system": CRANE_BY_NAME.replace(params={"mass": 1.0})}, "is not there; .* and params has mass"),
         ({"system": CRANE_BY_NAME.replace(force=unknown_force)}, "F_f has the keys laod; give hook, load"),
     ],
 )

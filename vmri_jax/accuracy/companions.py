@@ -15,9 +15,9 @@ and is run where the shares are asked for.
 
 A jump of a force can act at the same node in steps of H and of H / 2, too early or too late in both. In systems that
 are driven in time, and where an estimate is small beyond belief, a third companion takes about 1.6 times the steps,
-with few nodes in common with the run, and a fourth one 2.6 times where forces jump, with the order p = 1; the largest
-estimate of each node counts. Steps with fewer than `NODES_OF_EVENT` nodes in an event of `vmri_jax.mechanics.driving`
-are not certified from this event on.
+with few nodes in common with the run, and a fourth one 2.6 times where forces jump, with the order p = 1. At common
+nodes the largest estimate counts, and between them where the first one disagrees. Steps with fewer than
+`NODES_OF_EVENT` nodes in an event of `vmri_jax.mechanics.driving` are not certified from this event on.
 
 This is an estimate, not a bound. If the error falls with an order q below p, as for vibrations that the steps do not
 resolve, the true error is ``(1 - 2^-p) / (1 - 2^-q)`` times the estimate: 1.5 times for p = 2 and q = 1. Above order 2
@@ -77,6 +77,9 @@ FEWEST_DIVIDED = 20
 """Least number of macro steps between nodes that a further companion has in common with the run. With a smaller number
 a jump may act at the same node in all runs, so that none tells the error; with a larger one fewer nodes are
 compared."""
+AGREEMENT = 2.0
+"""Estimate of a further companion over the largest one since the last common node, up to which both agree. A larger
+value leaves errors of a jump too small between common nodes; a smaller one gives nodes the errors of others."""
 
 
 class UncertifiedWarning(UserWarning):
@@ -112,18 +115,31 @@ class Trial:
     ) -> "Trial":
         """A run with its errors, from the companion ``companion_of(2)``, and from further ones,
         ``companion_of(parts, whole)``, if the system is driven or its errors are below `DOUBTED` of the accuracy."""
-        halved, order, trajectory = companion_of(2), 1 if drives.jump else run.order, saved.trajectory(run)
-        errors = extrapolated(order, trajectory, halved)
-        has_failed = max(int(saved.failed_at), int(halved.failed_at)) >= 0
-        is_believed = not drives.names and np.abs(errors).max(initial=0.0) > DOUBTED * accuracy
-        if not (has_failed or is_believed):
-            errors = _with_further_companions(run, trajectory, errors, drives, companion_of, order)
-        return cls(run, saved, halved, errors, drives, family)
+        trial = cls(run, saved, companion_of(2), np.zeros(0), drives, family)
+        has_failed = max(int(saved.failed_at), int(trial.halved.failed_at)) >= 0
+        is_believed = not drives.names and np.abs(trial.first).max(initial=0.0) > DOUBTED * accuracy
+        is_enough = has_failed or is_believed
+        return replace(trial, errors=trial.first if is_enough else _with_further_companions(trial, companion_of))
 
     @cached_property
     def trajectory(self) -> Trajectory:
         """The trajectory of the run."""
         return self.saved.trajectory(self.run)
+
+    @property
+    def order(self) -> int:
+        """The order of the error: of the scheme, or 1 where forces jump."""
+        return 1 if self.drives.jump else self.run.order
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        """(k, n_s + n_f) errors of the positions from the first companion alone."""
+        return ratio(self.order) * (positions(self.trajectory) - positions(self.halved))
+
+    def shares(self, twice: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+        """Slow and fast shares (k, n_s + n_f) of `first`, from a run with twice the micro steps."""
+        fast = ratio(self.order) * (positions(self.trajectory) - positions(twice))
+        return self.first - fast, fast
 
     @cached_property
     def concerns(self) -> list[LostEnergyWarning]:
@@ -159,14 +175,14 @@ def told_error(trial: Trial, of: Callable | None = None, shares: bool = False) -
 def run_error(trial: Trial, of: Callable | None = None, shares: bool = False) -> RunError:
     """The error of a run, NaN where it is not certified."""
     run, trajectory, total = trial.run, trial.trajectory, trial.errors
-    fast = np.full_like(total, np.nan)
+    slow = fast = np.full_like(total, np.nan)
     if shares:
         twice = run.scheme.with_num_micro(2 * stage_scheme(run.scheme).num_micro)
-        fast = extrapolated(run.order, trajectory, companion(replace(run, scheme=of_one_type(twice)), 1))
+        slow, fast = trial.shares(companion(replace(run, scheme=of_one_type(twice)), 1))
     certified, growth = certified_nodes(trajectory, total)
     certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, trial.drives)
     until = np.asarray(trajectory.t)[certified][-1]
-    total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
+    total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, slow, fast))
     of_error = None if of is None else _of_error(of, trial, certified)
     q_s, q_f = np.split(total, [trajectory.states.q_s.shape[-1]], axis=1)
     shares_at_nodes = largest_of(slow), largest_of(fast)
@@ -178,27 +194,24 @@ def ratio(order: int, parts: float = 2) -> float:
     return 1.0 / (1.0 - parts**-order)
 
 
-def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
-    """(k, n_s + n_f) ``r (x - x')``: the part of the error of the positions x that vanishes with the steps halved in
-    the companion x'."""
-    return ratio(order) * (positions(trajectory) - positions(finer))
-
-
-def _with_further_companions(run, trajectory, errors, drives: Events, companion_of, order: int) -> np.ndarray:
-    """The largest of the errors and of the errors from further companions at each node; infinite if one of them
-    fails."""
+def _with_further_companions(trial: Trial, companion_of: Callable[..., Trajectory]) -> np.ndarray:
+    """The errors of the first companion, raised to those of further ones; infinite if one of these fails."""
+    run, errors = trial.run, np.array(trial.first)
     # From a compared node to the next, `stride` saved nodes later: `whole` steps of the run, `parts` of the companion.
-    strides = [s for s in range(1, run.num_saves + 1) if run.num_saves % s == 0]
-    stride = next((s for s in strides if s * run.save_every >= FEWEST_DIVIDED), run.num_saves)
+    least = range(math.ceil(FEWEST_DIVIDED / run.save_every), run.num_saves)
+    stride = next((s for s in least if run.num_saves % s == 0), run.num_saves)
     whole = stride * run.save_every
-    for factor in FURTHER_PARTS if drives.jump else FURTHER_PARTS[:1]:
+    between = errors[1:].reshape(-1, stride, errors.shape[1])  # a view: compared nodes are the last of each interval
+    for factor in FURTHER_PARTS if trial.drives.jump else FURTHER_PARTS[:1]:
         parts = next(k for k in range(max(round(factor * whole), 3), 10 * whole + 4) if math.gcd(k, whole) == 1)
         further = companion_of(parts, whole)
         if int(further.failed_at) >= 0:
             return np.full_like(errors, np.inf)
-        difference = ratio(order, parts / whole) * (positions(trajectory)[::stride] - positions(further))
-        others = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
-        errors = np.where(np.abs(others) > np.abs(errors), others, errors)
+        difference = positions(trial.trajectory)[::stride] - positions(further)
+        other = ratio(trial.order, parts / whole) * difference[1:, None]
+        disagrees = np.abs(other) > AGREEMENT * np.abs(between).max(axis=1, keepdims=True)
+        is_compared = np.arange(stride)[:, None] == stride - 1
+        between[:] = np.where(disagrees | is_compared & (np.abs(other) > np.abs(between)), other, between)
     return errors
 
 
@@ -236,10 +249,12 @@ def first_unseen(run: Simulation, drives: Events) -> float:
 
 
 def _of_error(of: Callable, trial: Trial, certified: np.ndarray) -> np.ndarray:
-    """Error of a function of the run: NaN at nodes that are not certified; of a function without a value for each node
-    NaN unless all nodes are certified."""
+    """Error of a function of the run, raised like the largest error of a position by further companions; NaN at nodes
+    that are not certified, and without a value for each node unless all nodes are certified."""
     values, halved_values = (np.asarray(of(run)) for run in (trial.trajectory, trial.halved))
-    error = ratio(trial.run.order) * (values - halved_values)
+    estimate, largest = (np.abs(a).max(initial=0.0) for a in (trial.first, trial.errors))
+    raised = largest / estimate if estimate > 0 and largest < np.inf else (np.nan if largest > 0 else 1.0)
+    error = raised * ratio(trial.order) * (values - halved_values)
     has_node_values = error.shape[:1] == certified.shape
     shown = certified.reshape(-1, *(1,) * (error.ndim - 1)) if has_node_values else certified.all()
     return np.where(shown, error, np.nan)

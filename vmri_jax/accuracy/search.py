@@ -31,7 +31,6 @@ from vmri_jax.accuracy.companions import (
     check_function_of_run,
     companion,
     extent_of,
-    extrapolated,
     fewest_steps,
 )
 from vmri_jax.accuracy.families import LEAST_TIME, Family, seconds_of_steps, unit_of
@@ -344,10 +343,9 @@ class Search:
     def _third(self, trial: Trial, finer: Trial) -> list[Trial]:
         """A trial with the number of micro steps of the least time for an error, ``N^(p + 1) = (a / b) (F / S)``, if it
         promises less time than the number N of a trial, and 2 N of a `finer` one with the same macro steps."""
-        num_micro, p, run = trial.family.first, trial.run.order, trial.run
-        fast_share = extrapolated(p, trial.trajectory, finer.trajectory)
-        fast, slow = (float(largest_of(share).max()) for share in (fast_share, trial.errors - fast_share))
-        slow, fast = max(slow, LEAST_SHARE * fast), num_micro**p * fast
+        num_micro, p, run = trial.family.first, trial.order, trial.run
+        slow, fast = (float(largest_of(share).max()) for share in trial.shares(finer.trajectory))
+        slow, fast = max(slow, LEAST_SHARE * fast, np.finfo(float).tiny), num_micro**p * fast
         # time(N) = a + b N: b = (time(2 N) - time(N)) / N and a = time(N) - N b
         self.measure([trial, finer])
         seconds, finer_seconds = (self.seconds[t.family.expression] for t in (trial, finer))

@@ -116,8 +116,8 @@ def fast_signal(motion: Motion) -> Signal | None:
 
     Without such a spring, a coordinate of a fast body, chosen likewise.
     """
+    step = float(np.median(np.diff(motion.t))) if len(motion.t) > 1 else 0.0  # one node: a run that failed at once
     for signals in (_lengths(motion), _coordinates(motion)):
-        step = float(np.median(np.diff(motion.t)))
         fast = [s for s in signals if s.pace == "fast" and s.frequency * step < MOST_RADIANS_PER_NODE]
         if fast:
             return max(_seen(fast), key=lambda signal: signal.speed * signal.frequency)

@@ -21,7 +21,7 @@ from vmri_jax.ensembles.design import SCHEMES, STEPS, columns_of_problems
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.checks import check_flags, check_number
+from vmri_jax.mechanics.checks import check_flags, check_number, check_type
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.places import START, Index, Placed, places_of
 from vmri_jax.mechanics.slots import free
@@ -55,7 +55,13 @@ def sweep(
     arguments = read_sweep(file)
     problem = find_problem(arguments["system"])
     arguments["vary"] = by_name(problem, list(arguments["design"].described()))
-    drawn = "" if plot is None else _drawn(arguments["save"], problem)
+    drawn = [] if plot is None else drawn_by_default(arguments["save"], problem)
+    if plot is not None and not drawn:  # before anything runs
+        raise Refused(
+            f"--plot draws one number per run or per saved node, and save = {json.dumps(arguments['save'])} keeps "
+            f"neither. Add one to the file, e.g. save = {json.dumps([*arguments['save'], 'energy_error'])}, or a "
+            "function of your own."
+        )
     with _client(workers) as client:
         try:
             runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
@@ -66,19 +72,8 @@ def sweep(
             raise print_failure("Stopped", str(error)) from error
     _print_summary(runs)
     if plot is not None:
-        plots.save(plots.plot_ensemble(runs.open(), drawn, title=file.stem), plot)
-        print_written(f"Figure of {drawn}", plot)
-
-
-def _drawn(save: list[str], problem: Problem) -> str:
-    """The array that --plot draws, chosen before anything runs."""
-    drawn = drawn_by_default(save, problem)
-    if not drawn:
-        raise Refused(
-            f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one "
-            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own."
-        )
-    return drawn[-1]
+        plots.save(plots.plot_ensemble(runs.open(), drawn[-1], title=file.stem), plot)
+        print_written(f"Figure of {drawn[-1]}", plot)
 
 
 def read_sweep(file: Path) -> dict[str, Any]:
@@ -90,6 +85,9 @@ def read_sweep(file: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise Refused(f"{file} is no TOML: {error}.") from error
     check_keys(entries, ("system", "scheme", "out"), (*SETTINGS, "axes", "draws"), f"{file}")
+    kinds = {"system": (str, '"fpu"'), "out": (str, '"a.zarr"'), "axes": (dict, "[axes]"), "draws": (dict, "[draws]")}
+    for name in kinds.keys() & entries:
+        check_type(f"{file}: {name}", entries[name], *kinds[name])
     if ("axes" in entries) == ("draws" in entries):
         raise Refused(f"{file}: give either [axes] or [draws].")
     if "axes" in entries:
@@ -98,10 +96,10 @@ def read_sweep(file: Path) -> dict[str, Any]:
         design = _draws(file, entries["draws"])
     folder, scheme = file.resolve().parent, entries["scheme"]
     arguments = {name: entries[name] for name in SETTINGS if name in entries}
-    arguments["save"] = [_located(name, folder) for name in np.atleast_1d(arguments.get("save", "end")).tolist()]
+    arguments["save"] = [_located(str(name), folder) for name in np.atleast_1d(arguments.get("save", "end")).tolist()]
     return arguments | {
         "system": _located(entries["system"], folder),
-        "scheme": scheme if isinstance(scheme, str) else {name: name for name in scheme},
+        "scheme": scheme if isinstance(scheme, str) else {name: name for name in np.atleast_1d(scheme).tolist()},
         "out": folder / entries["out"],
         "design": design,
     }
@@ -125,14 +123,13 @@ def _axis(subject: str, entry) -> Any:
 
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
     check_keys(entries, ("count", "columns"), ("seed", "method"), f"{file}: draws")
-    columns = dict(entries["columns"])
+    columns = dict(check_type(f"{file}: draws.columns", entries["columns"], dict, "[draws.columns]"))
     for name, entry in columns.items():
         if isinstance(entry, Mapping):
             check_keys(entry, ("distribution",), WORDS, f"{file}: draws: {name}")
             draw, words = entry["distribution"], (entry.get("unit", ""), entry.get("description", ""))
             columns[name] = Draw(draw[0], tuple(draw[1:]), *words) if isinstance(draw, list) and draw else draw
-    chosen = {name: entries[name] for name in ("seed", "method") if name in entries}
-    return Draws(entries["count"], columns, **chosen)
+    return Draws(entries["count"], columns, **{name: entries[name] for name in ("seed", "method") if name in entries})
 
 
 def _located(name: str, folder: Path) -> str:
@@ -162,14 +159,15 @@ def _client(workers: str | None) -> Iterator[Any]:
 
 
 def _print_summary(runs: Ensemble) -> None:
-    texts = {
-        "runs": f"{len(runs):,}" + (f", of which {runs.failed_runs:,} failed" if runs.failed_runs else ""),
-        "computed now": f"{runs.computed:,} in {runs.seconds:.1f} s"
-        + (f", {runs.runs_per_second:,.0f} a second" if runs.computed else ""),
-        "chunks": f"{len(runs.done)} of {runs.chunks.count} are in the store, {runs.chunks.size:,} runs each",
-        "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
-    }
-    print_named(texts)
+    print_named(
+        {
+            "runs": f"{len(runs):,}" + (f", of which {runs.failed_runs:,} failed" if runs.failed_runs else ""),
+            "computed now": f"{runs.computed:,} in {runs.seconds:.1f} s"
+            + (f", {runs.runs_per_second:,.0f} a second" if runs.computed else ""),
+            "chunks": f"{len(runs.done)} of {runs.chunks.count} are in the store, {runs.chunks.size:,} runs each",
+            "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
+        }
+    )
 
 
 def by_name(problem: Problem, columns: Sequence[str]) -> Placed | None:

@@ -44,7 +44,7 @@ class Optimum:
         bounds: (m,) lower and upper bounds of the controls.
         trajectory: the motion at all macro nodes.
         cost: of the motion.
-        multipliers: (e,) derivatives of the least cost with respect to the values that the goal is set to.
+        multipliers: (e,) minus the derivatives of the least cost with respect to the values that the goal is set to.
         miss: largest absolute value of the goal equations.
         over: largest violation of a limit, 0 for none.
         gap: largest distance between the end of a step and the next node, relative to the largest node.
@@ -202,7 +202,7 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
 
 
 def transcribed(
-    problem, actuate, num_controls: int, aims: Mapping, bounds, scheme, macro_dt, num_steps, grid, solver
+    problem, actuate, num_controls: int, aims: dict, bounds, scheme, macro_dt, num_steps, grid, solver
 ) -> Transcription:
     """The optimal control problem on the grid of the scheme, from the arguments of `minimize`, which are checked.
 
@@ -234,7 +234,6 @@ def transcribed(
         dimensions, words = (0, "a number") if name in ("cost", "final_cost") else (1, "a vector, (n,)")
         if getattr(value, "ndim", None) != dimensions:
             raise Refused(f"minimize: {name} has {describe(value)}; it must be {words}.")
-    functions = {**NO_AIMS, **aims}
     setup = Transcription(
         system.replace(params=params),
         state,
@@ -242,7 +241,7 @@ def transcribed(
         solver or Solver(),
         np.asarray(float(macro_dt)),
         traced_once(actuate),
-        **{name: traced_once(function) for name, function in functions.items()},
+        **{name: traced_once(function) for name, function in (NO_AIMS | aims).items()},
         bounds=_bounds(bounds, num_controls),
         parts=parts,
     )

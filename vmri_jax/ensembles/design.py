@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.names import near, unknown
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
@@ -289,7 +289,7 @@ def _draw(name: str, entry) -> Draw:
         return entry
     if not (isinstance(entry, Sequence) and len(entry) and isinstance(entry[0], str)) or isinstance(entry, str):
         raise Refused(f"Draws: the column {name!r} is {entry!r}; give a distribution, e.g. ('uniform', 10, 50).")
-    return Draw(entry[0], tuple(float(x) for x in entry[1:]))
+    return Draw(entry[0], tuple(map(float, real_array(f"Draws: the column {name!r}", entry[1:], ndim=1))))
 
 
 def _axes(subject: str, columns: Mapping[str, Any]) -> dict[str, Axis]:
@@ -320,8 +320,7 @@ def columns_of_problems(columns: Sequence[str]) -> list[str]:
 
 def numbers_in(rows: Rows) -> Rows:
     """The columns of numbers that change the problem; steps and schemes are left out."""
-    columns = {name: rows[name] for name in columns_of_problems(list(rows))}
-    for name, values in columns.items():
-        if values.dtype.kind not in "if":
+    for name, values in rows.items():
+        if name != "scheme" and values.dtype.kind not in "if":
             raise Refused(f"ensemble: the column {name!r} has labels; give numbers. Only 'scheme' may have labels.")
-    return columns
+    return {name: rows[name] for name in columns_of_problems(list(rows))}

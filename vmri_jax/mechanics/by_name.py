@@ -56,8 +56,9 @@ class ByName:
         try:
             return self.function(*(value if part is None else part.by_name(value) for part, value in shaped))
         except KeyError as error:
-            parts = ("q_s", self.slow), ("q_f", self.fast)
-            names = [f"{name} has {', '.join(part.sizes) or 'none'}" for name, part in parts if part]
+            parts = {"q_s": self.slow, "q_f": self.fast, "params": arguments[-1]}
+            named = {name: getattr(part, "sizes", part) for name, part in parts.items()}
+            names = [f"{k} has {', '.join(map(str, v)) or 'none'}" for k, v in named.items() if isinstance(v, Mapping)]
             raise KeyError(f"{error.args[0]!r} is not there; {' and '.join(names)}") from error
 
 

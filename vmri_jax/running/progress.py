@@ -11,8 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import wraps
-from typing import ParamSpec, TypeVar, cast
 
 import jax.monitoring
 
@@ -21,8 +19,6 @@ from vmri_jax.refusals import Refused
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(what, done, total)`` before every piece of work and once at the end: `what` names the piece,
 `done` of `total` pieces are finished."""
-P = ParamSpec("P")
-R = TypeVar("R")
 ShowsProgress = bool | Progress
 """The argument ``progress`` of all functions that take long: True for a bar, False for occasional lines, or a
 `Progress` of the user."""
@@ -159,18 +155,6 @@ def check_progress(name: str, progress: ShowsProgress) -> None:
     """Refuse an argument `progress` of the function of this name that is neither True nor False nor a function."""
     if not (isinstance(progress, bool) or callable(progress)):
         raise Refused(f"{name}: progress is {progress!r}; give True, False, or a function of (what, done, total).")
-
-
-def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: `function` takes a `Progress` as its argument `progress`, the decorated one also True or False."""
-
-    @wraps(function)
-    def shown(*args: P.args, **kwargs: P.kwargs) -> R:
-        with progress_to(function.__name__, cast(ShowsProgress, kwargs.pop("progress", False))) as tell:
-            kwargs["progress"] = tell
-            return function(*args, **kwargs)
-
-    return shown
 
 
 def silent(what: str, done: int, total: int) -> None:

@@ -2,10 +2,12 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.summary import has_values
 
 
 class RunError(NamedTuple):
@@ -56,7 +58,7 @@ class RunError(NamedTuple):
         return self._replace(of=of, **at_nodes)
 
     def __repr__(self) -> str:
-        return f"RunError: {self.in_words()}"
+        return f"RunError: {self.in_words() if has_values(self) else eqx.tree_pformat(self._asdict())}"
 
     def in_words(self) -> str:
         """The largest error, its shares, and the time up to which it is certified."""

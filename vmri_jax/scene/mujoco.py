@@ -22,6 +22,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.scene.body import Frame
@@ -91,7 +92,7 @@ def _start(mujoco: Any, model: Any, qpos: Any, qvel: Any, key: str | int | None)
     for name, value in (("qpos", qpos), ("qvel", qvel)):
         if value is None:
             continue
-        value, target = np.asarray(value, dtype=float), getattr(data, name)
+        value, target = np.asarray(real_array(f"Scene.from_mujoco: {name}", value)), getattr(data, name)
         if value.shape != target.shape:
             raise Refused(f"Scene.from_mujoco: {name} has shape {value.shape}; the model needs {target.shape}.")
         if not np.isfinite(value).all():

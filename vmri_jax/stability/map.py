@@ -11,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 
 from vmri_jax.executors.executor import mapped
+from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.plots import LIGHT, NotebookFigure, Theme, new_figure, panel_grid
@@ -132,7 +133,11 @@ def stability_map(
         TypeError: a system or scheme of the wrong kind.
         ValueError: a grid that is not increasing and positive; several systems with several schemes.
     """
-    grid = _grid(omega_H)
+    grid = np.asarray(real_array("stability_map: omega_H", omega_H))
+    if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
+        values = f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"
+        expected = "give two or more positive values, increasing, e.g. numpy.linspace(0.05, 12, 240)"
+        raise Refused(f"stability_map: omega_H has shape {grid.shape} and values {values}; {expected}.")
     systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, SchemeLike) for s in schemes.values()):
@@ -207,15 +212,6 @@ def find_windows(
         edges.append(x[-1])
     edges = [float(edge) for edge in sorted(edges)]
     return list(zip(edges[::2], edges[1::2], strict=True))
-
-
-def _grid(omega_H) -> np.ndarray:
-    grid = np.asarray(omega_H, dtype=float)
-    if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
-        values = f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"
-        expected = "give two or more positive values, increasing, e.g. numpy.linspace(0.05, 12, 240)"
-        raise Refused(f"stability_map: omega_H has shape {grid.shape} and values {values}; {expected}.")
-    return grid
 
 
 def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: Theme = LIGHT) -> NotebookFigure:

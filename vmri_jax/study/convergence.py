@@ -23,7 +23,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, check_step_size, steps_until
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.prepare import prepare
-from vmri_jax.running.progress import Progress, shows_progress
+from vmri_jax.running.progress import Progress, progress_to
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
@@ -139,7 +139,6 @@ class ConvergenceStudy(RunTable):
         return data.reindex(scheme=self.schemes, case=self.cases, macro_dt=steps)
 
 
-@shows_progress
 def convergence_study(
     problem: Problem | HasProblem,
     schemes: Mapping[str, SchemeLike],
@@ -178,45 +177,48 @@ def convergence_study(
             another shape.
         Interrupted: Ctrl-C; carries the study of the runs that were done.
     """
-    problem = problem_of("convergence_study", problem)
-    if not schemes:
-        raise Refused("convergence_study: schemes is empty; give at least one, e.g. {'midpoint': fully_implicit(5)}.")
-    steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
-    if not steps:
-        raise Refused("convergence_study: macro_dt is empty; give the macro steps to run.")
-    cases = _cases(problem, params, reference, t_end, num_saves, progress)
-    labels = list(product(schemes, cases, steps))
-    arguments = [(cases[case][0], schemes[label], t_end, num_saves, solver, n) for label, case, n in labels]
-    total = len(labels)
+    with progress_to("convergence_study", progress) as tell:
+        problem = problem_of("convergence_study", problem)
+        if not schemes:
+            raise Refused(
+                "convergence_study: schemes is empty; give at least one, e.g. {'midpoint': fully_implicit(5)}."
+            )
+        steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
+        if not steps:
+            raise Refused("convergence_study: macro_dt is empty; give the macro steps to run.")
+        cases = _cases(problem, params, reference, t_end, num_saves, tell)
+        labels = list(product(schemes, cases, steps))
+        arguments = [(cases[case][0], schemes[label], t_end, num_saves, solver, n) for label, case, n in labels]
+        total = len(labels)
 
-    def tell(done: int, i: int) -> None:
-        progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total)
+        def told(done: int, i: int) -> None:
+            tell(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total)
 
-    stopped = None
-    try:
-        runs = mapped("convergence_study", _run, arguments, executor, tell)
-    except Interrupted as interrupted:
-        runs, stopped = interrupted.done, interrupted
-    energies, rows = {case: _energies(*of_case) for case, of_case in cases.items()}, []
-    for (label, case, n), run in zip(labels, runs, strict=True):
-        if run is not None:
-            problem, reference = cases[case]
-            errors = dict(zip(("error_q", "error_p"), reference.errors(run), strict=True))
-            numbers = t_end / n, n, energies[case]
-            rows.append(row_of(label, problem.system, schemes[label], run, *numbers, **errors, case=case))
-    study = ConvergenceStudy(tuple(rows), {case: reference for case, (_, reference) in cases.items()})
-    if stopped is not None:
-        raise Interrupted(study, len(rows), None, "runs") from None
-    if repeats:
-        with interruptible(lambda: study):
-            progress("measuring times", total, total)
-            timed = {str(i): _prepared(*arguments[i]).timed() for i, row in enumerate(rows) if not row.failed}
-            samples = interleaved(timed, repeats)
-        seconds = [float(np.median(samples.get(str(i), [np.nan]))) for i in range(total)]
-        rows = [replace(row, seconds=each) for row, each in zip(rows, seconds, strict=True)]
-        study = replace(study, rows=tuple(rows))
-    progress("done", total, total)
-    return study
+        stopped = None
+        try:
+            runs = mapped("convergence_study", _run, arguments, executor, told)
+        except Interrupted as interrupted:
+            runs, stopped = interrupted.done, interrupted
+        energies, rows = {case: _energies(*of_case) for case, of_case in cases.items()}, []
+        for (label, case, n), run in zip(labels, runs, strict=True):
+            if run is not None:
+                problem, reference = cases[case]
+                errors = dict(zip(("error_q", "error_p"), reference.errors(run), strict=True))
+                numbers = t_end / n, n, energies[case]
+                rows.append(row_of(label, problem.system, schemes[label], run, *numbers, **errors, case=case))
+        study = ConvergenceStudy(tuple(rows), {case: reference for case, (_, reference) in cases.items()})
+        if stopped is not None:
+            raise Interrupted(study, len(rows), None, "runs") from None
+        if repeats:
+            with interruptible(lambda: study):
+                tell("measuring times", total, total)
+                timed = {str(i): _prepared(*arguments[i]).timed() for i, row in enumerate(rows) if not row.failed}
+                samples = interleaved(timed, repeats)
+            seconds = [float(np.median(samples.get(str(i), [np.nan]))) for i in range(total)]
+            rows = [replace(row, seconds=each) for row, each in zip(rows, seconds, strict=True)]
+            study = replace(study, rows=tuple(rows))
+        tell("done", total, total)
+        return study
 
 
 Case = tuple[Problem, ReferenceSolution]

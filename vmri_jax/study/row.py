@@ -20,7 +20,7 @@ from vmri_jax.mechanics.terms import label
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.origin import Settings
 from vmri_jax.running.prepare import prepare
-from vmri_jax.running.progress import shows_progress
+from vmri_jax.running.progress import progress_to
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 from vmri_jax.schemes.scheme import galerkin
@@ -65,7 +65,6 @@ def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return q, p
 
 
-@shows_progress
 def reference_solution(
     problem: Problem | HasProblem,
     t_end: float,
@@ -95,33 +94,34 @@ def reference_solution(
     Raises:
         SimulationError: runs failed with every number of steps; carries the last run.
     """
-    problem = problem_of("reference_solution", problem)
-    run = prepare(problem, galerkin(1, degree, "gauss"), macro_dt=t_end / num_saves, num_steps=num_saves)
-    first, halvings = num_steps, 1
-    if first is None:
-        drives = events(problem.system, run.state, float(run.state.t) + t_end)
-        fewest = max(32, fewest_steps(run.scheme, drives, t_end))  # steps that see the events of forces
-        first = num_saves * -(-fewest // num_saves)
-        halvings = max(0, math.ceil(math.log2(max(MAX_STEPS, 2 * fewest) / first)))
-    coarse, best, last_error = None, None, np.inf
-    for n in (first * 2**k for k in range(halvings + 1)):
-        progress(f"reference solution, {n} steps", 0, 1)
-        trajectory = run(macro_dt=t_end / n, num_steps=n, throw=False)
-        fine = joined(trajectory) if bool(trajectory.success) else None
-        if coarse is not None and fine is not None:
-            error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))
-            if best is None or error_q < best.error_q:
-                best = ReferenceSolution(*fine, error_q, error_p)
-            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 of
-            # the positions the steps may still be too large
-            size = np.abs(fine[0]).max()
-            if error_q <= ROUNDOFF * size or last_error / 2 < error_q < 1e-6 * size:
-                break
-            last_error = error_q
-        coarse = fine
-    if best is None:
-        raise simulation_error(run.with_arguments(macro_dt=t_end / n, num_steps=n), trajectory)
-    return best
+    with progress_to("reference_solution", progress) as tell:
+        problem = problem_of("reference_solution", problem)
+        run = prepare(problem, galerkin(1, degree, "gauss"), macro_dt=t_end / num_saves, num_steps=num_saves)
+        first, halvings = num_steps, 1
+        if first is None:
+            drives = events(problem.system, run.state, float(run.state.t) + t_end)
+            fewest = max(32, fewest_steps(run.scheme, drives, t_end))  # steps that see the events of forces
+            first = num_saves * -(-fewest // num_saves)
+            halvings = max(0, math.ceil(math.log2(max(MAX_STEPS, 2 * fewest) / first)))
+        coarse, best, last_error = None, None, np.inf
+        for n in (first * 2**k for k in range(halvings + 1)):
+            tell(f"reference solution, {n} steps", 0, 1)
+            trajectory = run(macro_dt=t_end / n, num_steps=n, throw=False)
+            fine = joined(trajectory) if bool(trajectory.success) else None
+            if coarse is not None and fine is not None:
+                error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))
+                if best is None or error_q < best.error_q:
+                    best = ReferenceSolution(*fine, error_q, error_p)
+                # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6
+                # of the positions the steps may still be too large
+                size = np.abs(fine[0]).max()
+                if error_q <= ROUNDOFF * size or last_error / 2 < error_q < 1e-6 * size:
+                    break
+                last_error = error_q
+            coarse = fine
+        if best is None:
+            raise simulation_error(run.with_arguments(macro_dt=t_end / n, num_steps=n), trajectory)
+        return best
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import make_writable_folder
-from vmri_jax.running.progress import part, shows_progress
+from vmri_jax.running.progress import part, progress_to
 from vmri_jax.running.timing import seconds_each
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.html import embedded, write_page
@@ -126,7 +126,6 @@ class Recommendation(WorkPrecision):
         return self.setting.num_steps
 
 
-@shows_progress
 def tune(
     problem: Problem | HasProblem,
     error: float,
@@ -163,16 +162,17 @@ def tune(
     Warns:
         UserWarning: events of forces demand many steps.
     """
-    problem = problem_of("tune", problem)
-    tuning = Tuning("tune: error", problem, t_end, menu, num_saves=num_saves, solver=solver, progress=progress)
-    tuning.check(error)
-    with interruptible(tuning.runs):
-        choice = Recommendation(tuning.look_for(error, exhaustive).rows, error=error)
-        if choice.setting is None:
-            raise _nothing(tuning, error)
-    progress("done", 1, 1)
-    tuning.warn_of_events("tune", choice.scheme)
-    return choice
+    with progress_to("tune", progress) as tell:
+        problem = problem_of("tune", problem)
+        tuning = Tuning("tune: error", problem, t_end, menu, num_saves=num_saves, solver=solver, progress=tell)
+        tuning.check(error)
+        with interruptible(tuning.runs):
+            choice = Recommendation(tuning.look_for(error, exhaustive).rows, error=error)
+            if choice.setting is None:
+                raise _nothing(tuning, error)
+        tell("done", 1, 1)
+        tuning.warn_of_events("tune", choice.scheme)
+        return choice
 
 
 def _nothing(tuning: Tuning, error: float) -> Exception:
@@ -263,7 +263,6 @@ def default_t_end(problem: Problem) -> float:
     return float(f"{PERIODS * 2 * math.pi / frequency:.0e}")
 
 
-@shows_progress
 def cost_report(
     problem: Problem | HasProblem,
     name: str,
@@ -291,31 +290,32 @@ def cost_report(
         ValueError: errors below round-off, or above the extent of the motion; no errors, and no motion.
         Interrupted: Ctrl-C; carries the runs of the search.
     """
-    problem, out = problem_of("cost_report", problem), Path(out)
-    make_writable_folder(out)
-    t_end = default_t_end(problem) if t_end is None else t_end
-    tuning, answered = Tuning("cost_report: each of errors", problem, t_end, menu, progress=progress), []
-    for error in errors or ():
-        tuning.check(error)
-    with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
-        tuning.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
-        errors = sorted(errors or _default_errors(tuning))
-        tuning.check_extent(errors[-1])
-        try:
-            # The smallest error first: families that are given up for it are hopeless for larger errors.
-            for i, error in enumerate(errors):
-                tuning.progress = part(progress, i, len(errors))
-                tuning.look_for(error)
-                answered.append(error)
-        finally:
-            report = CostReport(out / "cost.html", name, t_end, tuple(answered), tuning.runs())
-            # Constraints cost more than their evaluations: the runs have no bound.
-            if report.reached and not problem.system.is_constrained:
-                report = replace(report, bound=bound_of(prices(problem), report.curves.pareto()))
-            if answered:
-                _write(report, problem)
-    progress("done", 1, 1)
-    return report
+    with progress_to("cost_report", progress) as tell:
+        problem, out = problem_of("cost_report", problem), Path(out)
+        make_writable_folder(out)
+        t_end = default_t_end(problem) if t_end is None else t_end
+        tuning, answered = Tuning("cost_report: each of errors", problem, t_end, menu, progress=tell), []
+        for error in errors or ():
+            tuning.check(error)
+        with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
+            tuning.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
+            errors = sorted(errors or _default_errors(tuning))
+            tuning.check_extent(errors[-1])
+            try:
+                # The smallest error first: families that are given up for it are hopeless for larger errors.
+                for i, error in enumerate(errors):
+                    tuning.progress = part(tell, i, len(errors))
+                    tuning.look_for(error)
+                    answered.append(error)
+            finally:
+                report = CostReport(out / "cost.html", name, t_end, tuple(answered), tuning.runs())
+                # Constraints cost more than their evaluations: the runs have no bound.
+                if report.reached and not problem.system.is_constrained:
+                    report = replace(report, bound=bound_of(prices(problem), report.curves.pareto()))
+                if answered:
+                    _write(report, problem)
+        tell("done", 1, 1)
+        return report
 
 
 def prices(problem: Problem) -> dict[str | int, float]:
