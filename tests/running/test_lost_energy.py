@@ -46,6 +46,19 @@ def test_a_weight_that_rests_at_the_origin(scheme):
     np.testing.assert_allclose(run.multipliers()["constraint"], -19.62)
 
 
+def test_a_pushed_system_that_explodes_is_told_and_one_in_resonance_is_not():
+    def push(t, q_s, q_f, v_s, v_f, params):
+        return q_s, 10.0 * jnp.sin(100.0 * t)[None]
+
+    system = vm.System(vm.ConstantMass([], [1.0]), None, lambda q_f, params: 5e3 * q_f[0] ** 2, force=push)
+    pushed = vm.prepare(vm.Problem(system, [], [0.01]), vm.fully_explicit(1), macro_dt=0.01, num_steps=40)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pushed()
+    with pytest.warns(vm.LostEnergyWarning, match=r"the energy, .* or less at the start, has changed by"):
+        pushed(macro_dt=0.03)
+
+
 def rotating_frame(q_s, q_f, v_s, v_f, turn):
     velocity = v_f + turn * jnp.stack([-q_f[1], q_f[0]])
     return velocity @ velocity / 2

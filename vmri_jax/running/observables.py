@@ -23,10 +23,11 @@ from vmri_jax.steppers.results import Result
 
 
 class LostEnergyWarning(UserWarning):
-    """The energy of a system that keeps it has changed by more than half of the largest kinetic energy of a run."""
+    """The energy of a system that keeps it has changed by more than half of the largest kinetic energy of a run, or the
+    energy of any other system by `GROWN` of what it was."""
 
     sentence = (
-        "the computed motion is wrong: the energy, which the system keeps, has changed by {change:.3g} at t = {t:.4g}, "
+        "the computed motion is wrong: the energy{which} has changed by {change:.3g} at t = {t:.4g}, "
         "and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, where slow forces are kicks below half "
         "a period of the fastest vibration; vmri_jax.stability.advise(problem, scheme, macro_dt=...) says which are "
         "stable for small motions."
@@ -46,6 +47,10 @@ class SingularCoordinatesWarning(LostEnergyWarning):
 REPORTED_CHANGE = 0.5
 """Change of the energy, as a part of the largest kinetic energy, above which the user is warned; a larger value misses
 slower instabilities."""
+GROWN = 1e6
+"""Change of the energy of a system that forces or drives move, as a part of the terms of the energy at the start, or
+of the kinetic energy of velocities ``q / H`` there if that is larger, above which the user is warned. A larger value
+misses short explosions; a smaller one warns of motion that forces begin from rest."""
 ROUNDOFF_OF_ENERGY = 1e-9
 """Change of the energy, as a part of the sum of the moduli of its terms, up to which it is round-off. A larger value
 hides losses in systems whose terms cancel."""
@@ -149,7 +154,8 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
     *Lost energy*: the system keeps its energy, and the energy has changed by more than half of the largest kinetic
     energy. A system at rest moves by round-off: n steps H change velocities by up to
     ``sqrt(n) ROUNDOFF_OF_STEP |q| / H``, in random directions; changes below the kinetic energy of these velocities, or
-    below the round-off of the energy's terms, do not count.
+    below the round-off of the energy's terms, do not count. Where forces or drives change the energy, only a change by
+    `GROWN` of the energy of the start tells; systems that start without energy at the origin are not judged.
 
     *Singular coordinates*: the mass matrix changes by a factor between two nodes, and the energy changes beside them.
     Forces change the energy, too: where they do, only steps that are all saved tell.
@@ -159,9 +165,7 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
     energy, kinetic = table[..., 0], table[..., Observables._fields.index("kinetic")]
     if not np.any(np.ptp(energy, axis=-1) > min(CHANGE_AT_POLE, REPORTED_CHANGE) * kinetic.max(axis=-1)):
         return []  # the usual case, within microseconds
-    keeps, may_be_singular = system.keeps_energy, not system.has_constant_mass
-    if not keeps and not (may_be_singular and save_every == 1):
-        return []
+    keeps = system.keeps_energy
     t, nodes = np.atleast_2d(t), Observables.of(table.reshape(-1, *table.shape[-2:]))
     kinetic, change = nodes.kinetic.max(axis=1), np.abs(nodes.energy - nodes.energy[:, :1])
     of_a_step = (ROUNDOFF_OF_STEP / np.asarray(macro_dt)) ** 2 * nodes.rounding.max(axis=1)
@@ -171,7 +175,10 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
     beside = jumps[:, 1:-1] | jumps[:, :-2] | jumps[:, 2:]
     change_at_pole = np.where(beside, np.abs(np.diff(nodes.energy)), 0.0)
     is_singular = change_at_pole.max(axis=1) > np.maximum(CHANGE_AT_POLE * kinetic, roundoff)
-    is_lost = keeps & ~is_singular & (change.max(axis=1) > np.maximum(REPORTED_CHANGE * kinetic, roundoff))
+    is_singular &= keeps or save_every == 1
+    of_start = np.maximum(nodes.terms[:, 0], nodes.rounding[:, 0] / np.asarray(macro_dt) ** 2)
+    largest = REPORTED_CHANGE * kinetic if keeps else GROWN * np.where(of_start > 0, of_start, np.inf)
+    is_lost = ~is_singular & (change.max(axis=1) > np.maximum(largest, roundoff))
     warnings_of_lanes: list[LostEnergyWarning] = []
     for warning, wrong, sizes in (
         (SingularCoordinatesWarning, is_singular, change_at_pole),
@@ -181,6 +188,7 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
             lane = int(wrong.argmax())
             node = sizes[lane].argmax()
             lanes = f"in {wrong.sum()} of {len(wrong)} lanes, the first of them lane {lane}, " if table.ndim > 2 else ""
-            numbers = {"t": t[lane, node], "change": sizes[lane, node], "kinetic": kinetic[lane]}
+            which = ", which the system keeps," if keeps else f", {of_start[lane]:.3g} or less at the start,"
+            numbers = {"which": which, "t": t[lane, node], "change": sizes[lane, node], "kinetic": kinetic[lane]}
             warnings_of_lanes.append(warning(lanes + warning.sentence.format(**numbers)))
     return warnings_of_lanes
