@@ -51,6 +51,8 @@ COLLOCATES = True
 """Whether `Collocation` solves a single interval of high degree, for all variables at once."""
 DRIFTS = True
 """Whether `Rattle` solves a drift along constraints, for its multipliers alone."""
+LANES_IN_TURN = True
+"""Whether lanes of a batch with larger equations are computed one after the other on a CPU."""
 
 
 def matmul(a, b):

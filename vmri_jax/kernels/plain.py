@@ -9,8 +9,8 @@ CONTRACTION = -1.0
 """Largest ratio of two corrections with which matrices are kept: negative, so that all passes are exact."""
 LARGEST_RENEWED = 10**9
 """Rows of K up to which every macro step computes it: all sizes."""
-DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = False
-"""Steppers do not use any special case."""
+DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = LANES_IN_TURN = False
+"""Steppers and batches do not use any special case."""
 
 
 def matmul(a, b):
