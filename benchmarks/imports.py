@@ -94,12 +94,13 @@ def their_accelerations(model: Any, data: Any) -> dict[str, np.ndarray]:
 
 
 def apart(scene: Any, model: Any, data: Any) -> tuple[float, float]:
-    """Largest difference of the accelerations of a scene and of MuJoCo, and their size, the largest of MuJoCo."""
+    """Largest difference of the accelerations of a scene and of MuJoCo, and their size, the largest of MuJoCo, or 1
+    m/s^2 if that is larger."""
     from benchmarks.body_motions import accelerations, state_of  # only now: scenes start JAX
 
     ours, theirs = accelerations(scene, state_of(scene)), their_accelerations(model, data)
     differences = (float(np.abs(ours[name][2][:3] - a).max()) for name, a in theirs.items())
-    return max(differences), max(float(np.abs(a).max()) for a in theirs.values())
+    return max(differences), max(1.0, *(float(np.abs(a).max()) for a in theirs.values()))
 
 
 def of_centres(model: Any, values: np.ndarray) -> dict[str, np.ndarray]:

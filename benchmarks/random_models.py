@@ -174,7 +174,7 @@ def compare(seed: int) -> dict[str, Any]:
             raise
         return row | {"refused": ", ".join(refused)}
     difference, size = apart(scene, model, data)
-    return row | {"difference": difference / max(1.0, size)}
+    return row | {"difference": difference / size}
 
 
 def keyframe(mujoco: Any, seed: int, data: Any) -> Any:

@@ -306,6 +306,10 @@ NO_STEP = {"macro_dt": None}
         ({"design": {"macro_dt": [0.01]}}, r"macro_dt is a column and an argument"),
         ({"design": {"num_micro": [1]}}, r"num_micro is a column and an argument"),
         ({"design": {"macro_dt": [-0.01]}} | NO_STEP, r"macro_dt is .*; it must be a positive number"),
+        (
+            {"design": {"macro_dt": [0.01, -0.01]}, "t_end": None, "num_steps": 4} | NO_STEP,
+            r"macro_dt is .*; it must be a positive number",
+        ),
         ({"design": Draws(4, {"num_steps": ("uniform", 1, 9)})} | NO_STEP, r"num_steps cannot be drawn"),
         ({"design": {"t": [0.0, 1.0]}}, r"vary changes t, so that t_end does not fix the number of steps"),
         ({"t_end": None}, r"got macro_dt; give two of"),

@@ -284,6 +284,8 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
     unused = [name for name, is_used in zip(row, used, strict=True) if not is_used]
     if unused:
         warn_user(f"ensemble: no run depends on {', '.join(unused)}: vary does not use these columns.")
+    if "macro_dt" in work.columns:
+        check_step_size(design.rows(0, len(design))["macro_dt"], "ensemble", ndim=None)
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [name for name in OVER_NODES if name in work.save]
