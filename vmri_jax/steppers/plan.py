@@ -28,6 +28,7 @@ from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import POSITIONS
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import PlacedTerm, lagrangian, placed_potentials
@@ -278,7 +279,8 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
         term, rule = potential
         if rule.only_kicks:
             continue
-        sees_slow, sees_fast = depends_on(lambda *q, term=term: term.at(q, system.params), q_s, q_f)
+        seen = depends_on(lambda *q, term=term: term.at(q, system.params), q_s, q_f)  # all, by a function that prints
+        sees_slow, sees_fast = (used and name in term.arguments for name, used in zip(POSITIONS, seen, strict=True))
         if rule.grid == "macro":
             if term.name == "W" or sees_fast:
                 return None
