@@ -37,11 +37,11 @@ a core. Chunks with more of them wait for slower memory."""
 FEWEST_LANES = 64
 """Fewest lanes of a chunk, even where they exceed `NUMBERS_PER_CHUNK`: with fewer lanes the fixed cost of an operation
 outweighs the cache."""
-FEWEST_IN_TURN = 64
-"""Positions of a lane at all nodes of a macro step from which lanes with constraints are computed one after the other
-on a CPU, and compile in half of the time. Vectors over the lanes are faster below: TSP takes 0.75 of the time, with
-`fully_implicit(5)`; above they are slower, since all lanes wait for the lane with the most passes: SAM takes 1.3 times,
-a satellite of rigid bodies 1.9 times the time."""
+FEWEST_IN_TURN = 16
+"""Positions of a lane at all nodes of a micro step from which lanes with constraints are computed one after the other
+on a CPU, and compile in half of the time. Vectors over the lanes are faster below: TSP, with 9 coordinates, takes 0.75
+of the time; above they are slower, since all lanes wait for the lane with the most passes: SAM, with 18, takes 1.3
+times, a satellite of rigid bodies 1.9 times the time."""
 MOST_LANES = 1024
 """Most lanes of a chunk; with more, the last chunk of a batch may be mostly padding."""
 
@@ -187,17 +187,18 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State,
 def lanes_at_once(run: Simulation) -> int:
     """Lanes of a chunk where the user gives none: the largest power of two that fits into the cache, between the two
     limits."""
-    return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane(run), FEWEST_LANES, MOST_LANES)))
+    numbers_per_lane = run.scheme.num_micro * positions_of_micro_step(run)
+    return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane, FEWEST_LANES, MOST_LANES)))
 
 
-def numbers_per_lane(run: Simulation) -> int:
-    """Positions at all nodes of a macro step."""
-    return run.scheme.num_micro * run.scheme.degree * (run.state.q_s.size + run.state.q_f.size)
+def positions_of_micro_step(run: Simulation) -> int:
+    """Positions at all nodes of a micro step."""
+    return run.scheme.degree * (run.state.q_s.size + run.state.q_f.size)
 
 
 def are_in_turn(run: Simulation) -> bool:
     """Whether lanes are computed one after the other, by the measurements at `FEWEST_IN_TURN`."""
-    is_large = run.system.is_constrained and numbers_per_lane(run) >= FEWEST_IN_TURN
+    is_large = run.system.is_constrained and positions_of_micro_step(run) >= FEWEST_IN_TURN
     return LANES_IN_TURN and jax.default_backend() == "cpu" and (is_large or not run.system.has_constant_mass)
 
 
