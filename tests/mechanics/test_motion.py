@@ -23,7 +23,7 @@ def test_a_pendulum_by_the_formula():
 
 
 def test_multipliers_of_rods_that_do_not_couple_have_derivatives():
-    """``lambda_i = -g y_i / |q_i|^2`` of two pendulums at rest; those of `jnp.linalg.lstsq` are NaN, as their
+    """``lambda_i = -g y_i / |q_i|^2`` of two pendulums at rest; derivatives of `jnp.linalg.lstsq` are NaN, as their
     singular values are equal."""
     rods = jax.vmap(lambda q: own_rod([], q, None)[0])
     system = System(

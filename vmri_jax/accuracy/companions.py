@@ -195,7 +195,8 @@ def ratio(order: int, parts: float = 2) -> float:
 
 
 def _with_further_companions(trial: Trial, companion_of: Callable[..., Trajectory]) -> np.ndarray:
-    """The errors of the first companion, raised to those of further ones; infinite if one of these fails."""
+    """The errors of the first companion, raised to the errors from further companions; infinite if one of
+    these fails."""
     run, errors = trial.run, np.array(trial.first)
     # From a compared node to the next, `stride` saved nodes later: `whole` steps of the run, `parts` of the companion.
     least = range(math.ceil(FEWEST_DIVIDED / run.save_every), run.num_saves)

@@ -202,9 +202,10 @@ def simulate_batch(
         batch = vm.simulate_batch(car, scheme, params={"omega": omegas}, macro_dt=0.01, t_end=10.0)
         print(batch.lane(3))  # of omegas[3]
 
-    Whatever has no axis of lanes holds for all lanes. Lanes are computed side by side (`jax.vmap`), in chunks that fit
-    into the cache. Unlike `simulate`, a failed step never raises: its lane is NaN after the step and has its status in
-    ``.result`` and ``.failed_at``; other lanes do not change. A `FailedLanesWarning` says how many lanes failed. A lane
+    Whatever has no axis of lanes holds for all lanes. Lanes of small systems are computed side by side (`jax.vmap`), in
+    chunks that fit into the cache, lanes of larger ones one after the other (`vmri_jax.running.batch`). Unlike
+    `simulate`, a failed step never raises: its lane is NaN after the step and has its status in ``.result`` and
+    ``.failed_at``; other lanes do not change. A `FailedLanesWarning` says how many lanes failed. A lane
     fails in its first step if its start violates the constraints of its parameters, in positions or velocities. Lanes
     that the first matrix of "auto" does not solve are run again with exact matrices, whose program is compiled at the
     first such lane.

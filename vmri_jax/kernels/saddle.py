@@ -21,7 +21,8 @@ def regularized(a):
 
 def least_norm(a, rows):
     """``a^+ rows`` for a = ``G M^-1 G^T`` (n, n) with a diagonal of ones, in which the units of rows cancel: of
-    dependent rows the least multipliers. Derivatives are those of a^+: `lstsq` has none where rows do not couple."""
+    dependent rows the least multipliers. The derivatives of a^+ are finite where rows do not couple;
+    `lstsq` has none there."""
     xp = np if isinstance(a, np.ndarray) else jnp
     diagonal = xp.diagonal(a)
     root = xp.sqrt(xp.where(diagonal > 0, diagonal, 1.0))

@@ -81,9 +81,15 @@ def library(*values):
 
 
 @overload
-def split_at(vector, end: int, /) -> tuple[Any, Any]: ...
+def split_at(vector, end: int, /) -> tuple[Any, Any]:
+    """The two parts before and from an index."""
+
+
 @overload
-def split_at(vector, *ends: int) -> tuple[Any, ...]: ...
+def split_at(vector, *ends: int) -> tuple[Any, ...]:
+    """The parts between several indices."""
+
+
 def split_at(vector, *ends):
     """The parts of a joined vector, between the indices `ends` along its last axis: ``q_s, q_f = split_at(q, n_s)``.
 

@@ -24,7 +24,7 @@ from vmri_jax.steppers.results import Result
 
 class LostEnergyWarning(UserWarning):
     """The energy of a system that keeps it has changed by more than half of the largest kinetic energy of a run, or the
-    energy of any other system by `GROWN` of what it was."""
+    energy of a system that forces or drives move by `GROWN` times its size at the start."""
 
     sentence = (
         "the computed motion is wrong: the energy{which} has changed by {change:.3g} at t = {t:.4g}, "

@@ -115,8 +115,8 @@ class StepEquations(eqx.Module):
             h^2 (w_0 + w_r)               where micro intervals meet
             h^2 w_j                       inside
 
-        and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_last / H) w_r)`` at S_0
-        and ``H^2 w_i`` at S_i: the constraint force that the step before has left out at the common node belongs to
+        and, with the weights of the slow constraint rule, the factors of g_s are ``H^2 (w_0 + (H_last / H) w_r)`` at
+        S_0 and ``H^2 w_i`` at S_i: the constraint force that the step before has left out at the common node belongs to
         this step.
         """
         scheme, macro_dt = self.scheme, self.macro_dt

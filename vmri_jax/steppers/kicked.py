@@ -119,8 +119,8 @@ class Kicked(Stepper):
 
 @dataclass(frozen=True)
 class Repeated(Stepper):
-    """`count` shorter steps of a kicked stepper: those of the fast variables in a macro step, or the steps between two
-    kicks of a potential with a longer interval."""
+    """`count` shorter steps of a kicked stepper: the steps of the fast variables in a macro step, or the steps between
+    two kicks of a potential with a longer interval."""
 
     inner: Kicked
     count: int
