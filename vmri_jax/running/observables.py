@@ -162,10 +162,13 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
 
     `table` has the `Observables` (..., k, 9) at the times t (..., k); of the system only the structure counts.
     """
-    energy, kinetic = table[..., 0], table[..., Observables._fields.index("kinetic")]
-    if not np.any(np.ptp(energy, axis=-1) > min(CHANGE_AT_POLE, REPORTED_CHANGE) * kinetic.max(axis=-1)):
+    energy, kinetic, terms = (table[..., Observables._fields.index(name)] for name in ("energy", "kinetic", "terms"))
+    keeps, sees_poles = system.keeps_energy, not system.has_constant_mass and save_every == 1
+    least = (
+        min(CHANGE_AT_POLE, REPORTED_CHANGE) * kinetic.max(axis=-1) if keeps or sees_poles else GROWN * terms[..., 0]
+    )
+    if not np.any(np.ptp(energy, axis=-1) > least):
         return []  # the usual case, within microseconds
-    keeps = system.keeps_energy
     t, nodes = np.atleast_2d(t), Observables.of(table.reshape(-1, *table.shape[-2:]))
     kinetic, change = nodes.kinetic.max(axis=1), np.abs(nodes.energy - nodes.energy[:, :1])
     of_a_step = (ROUNDOFF_OF_STEP / np.asarray(macro_dt)) ** 2 * nodes.rounding.max(axis=1)
