@@ -22,7 +22,6 @@ matmul = _chosen.matmul
 matvec = _chosen.matvec
 max_abs = _chosen.max_abs
 solve = _chosen.solve
-solve_masses = _chosen.solve_masses
 
 COLLOCATES = _chosen.COLLOCATES
 CONTRACTION = _chosen.CONTRACTION

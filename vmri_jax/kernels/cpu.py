@@ -14,10 +14,6 @@ UNROLLED = 8
 compiling slower: larger systems are eliminated in a loop."""
 UNROLLED_TURNS = 3
 """Turns of that loop that XLA unrolls. A larger number makes compiling slower."""
-FEW = 3
-"""Most variables whose velocities ``M^-1 p`` are solved for without LAPACK. Up to this number a macro step of joint
-coordinates or angles is one kernel, 1.5 us for two angles in place of 4.6. Larger steps compile in parts: with a larger
-number LLVM takes 1.5 times as long for an arm of four joints."""
 REGISTER = 4
 """Float64 numbers in a vector register (AVX2); rows of matrices are padded to a multiple of it."""
 ELEMENTWISE = 16
@@ -89,13 +85,6 @@ def solve(a, b):
         row = rows[0, 1:] / rows[0, 0]
         rows = jnp.concatenate([rows[1:, 1:] - rows[1:, :1] * row, row[None]])  # the first row becomes the last
     return rows
-
-
-def solve_masses(m, p):
-    """The v with ``m v = p`` for a mass matrix (n, n) and p (n,) or (n, k)."""
-    if len(p) <= FEW:
-        return solve(m, p.reshape(len(p), -1)).reshape(p.shape)
-    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(m), True), p)
 
 
 def _eliminated(k, rows):

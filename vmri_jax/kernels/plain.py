@@ -28,11 +28,6 @@ def solve(a, b):
     return jnp.linalg.solve(a, b)
 
 
-def solve_masses(m, p):
-    """The v with ``m v = p`` for a mass matrix (n, n) and p (n,) or (n, k)."""
-    return jnp.linalg.solve(m, p)
-
-
 def inverse(a):
     """The inverses of a (..., n, n), real or complex."""
     return jnp.linalg.inv(a)

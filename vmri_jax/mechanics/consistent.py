@@ -15,8 +15,7 @@ import numpy as np
 from vmri_jax.kernels.saddle import least_norm, regularized
 from vmri_jax.mechanics.arrays import is_known, library, quickly_compiled, split_at
 from vmri_jax.mechanics.constraints import configuration
-from vmri_jax.mechanics.projection import legendre, mass_and_momentum, project_momentum
-from vmri_jax.mechanics.structure import has_constant_hessian
+from vmri_jax.mechanics.projection import is_quadratic, legendre, mass_and_momentum, project_momentum
 from vmri_jax.mechanics.system import System
 
 PROJECTION_STEPS = 20
@@ -61,13 +60,8 @@ def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
     constraints may take velocity away, and moving constraints may add it.
     """
     n_s, arguments = np.shape(q_s)[0], (system, t, q_s, q_f, v_s, v_f)
-
-    def kinetic(v):
-        return system.kinetic_energy(q_s, q_f, *split_at(v, n_s))
-
     v = library(v_s, v_f).concatenate([v_s, v_f])
-    is_quadratic = system.has_constant_mass or has_constant_hessian(kinetic, v)
-    momenta = _momenta_of_numbers if is_quadratic and is_known(arguments) else _momenta
+    momenta = _momenta_of_numbers if is_quadratic(system, q_s, q_f) and is_known(arguments) else _momenta
     p, projected_p, projected_v = momenta(*arguments)
     # |v - v'|^2 / max(|v|^2, |v'|^2) with |v|^2 = v . p
     xp = library(v, p, projected_p)

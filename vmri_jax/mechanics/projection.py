@@ -57,8 +57,8 @@ def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
     return numbers_of(_program_of_masses(system, q_s, q_f, v))
 
 
-def _masses_of_function(system: System, q_s, q_f, v):
-    """`mass_and_momentum` of a T that is a function, as a part of a program."""
+def masses_of_function(system: System, q_s, q_f, v):
+    """`mass_and_momentum` of a T that is a function, at velocities (n,), as a part of a program."""
     masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
     if masses is not None:
         return masses, matvec(masses, v)
@@ -67,13 +67,20 @@ def _masses_of_function(system: System, q_s, q_f, v):
     return jax.vmap(times_mass)(jnp.eye(p.size)), p
 
 
-_program_of_masses = quickly_compiled(_masses_of_function)
+_program_of_masses = quickly_compiled(masses_of_function)
 
 
 def have_closed_masses(energies: Iterable[Term]) -> bool:
     """Whether these kinetic energies are ``v^T M v / 2`` with masses M in closed form, see `WithMassMatrix`."""
     functions = [innermost(term.function) for term in energies]
     return all(isinstance(function, WithMassMatrix) and function.has_mass_matrix for function in functions)
+
+
+def is_quadratic(system: System, q_s, q_f) -> bool:
+    """Whether the kinetic energy is at most quadratic in the velocities."""
+    if system.has_constant_mass or have_closed_masses(system.of_kind("kinetic")):
+        return True
+    return has_constant_hessian(partial(system.kinetic_energy, q_s, q_f), jnp.zeros(q_s.size), jnp.zeros(q_f.size))
 
 
 def closed_masses(energies: Iterable[Term], q_s, q_f, params):
@@ -133,26 +140,23 @@ def _with_constant_masses(system: System, q_s, q_f, p, constraints, sparsity: Sp
 
 
 def _with_masses(system: System, q_s, q_f, p, constraints, guess):
-    def kinetic(v):
-        return system.kinetic_energy(q_s, q_f, *split_at(v, q_s.size))
-
     v = gradient = jnp.zeros_like(p)
     masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
-    is_quadratic = masses is not None or has_constant_hessian(kinetic, p)
-    if not is_quadratic:
+    in_one_solve = is_quadratic(system, q_s, q_f)
+    if not in_one_solve:
         guess = v if guess is None else jnp.concatenate(guess)
         v, impulse = _velocity_and_impulse(system, q_s, q_f, constraints, p, guess)
     if masses is None:
-        masses, gradient = _masses_of_function(system, q_s, q_f, v)
-    if is_quadratic:
+        masses, gradient = masses_of_function(system, q_s, q_f, v)
+    if in_one_solve:
         v, impulse = _by_one_solve(masses, p - gradient, *constraints)  # p = M v + dT/dv(0)
     return (p - impulse if constraints[1].size else p), v, masses
 
 
 def _by_one_solve(masses, p, jacobian, rates):
     """The velocity ``v - M^-1 G^T mu``, with ``M v = p`` and ``G M^-1 G^T mu = G v + dg/dt``, and ``G^T mu``."""
-    solve = partial(kernels.solve_masses, masses)
-    # the derivative is one more solve: JAX does not differentiate the elimination
+    solve = partial(jax.scipy.linalg.cho_solve, (jnp.linalg.cholesky(masses), True))
+    # the derivative is one more solve: JAX does not differentiate the factors
     v = jax.lax.custom_linear_solve(partial(matvec, masses), p, lambda _, b: solve(b), symmetric=True)
     if not jacobian.shape[0]:
         return v, jnp.zeros_like(p)

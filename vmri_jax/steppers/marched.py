@@ -172,6 +172,12 @@ class Marched(StepSolver):
             rate=jnp.where(is_first, memory.rate, jnp.inf),
         )
 
+        def is_roundoff(now: Passed):
+            """Whether the residual is round-off of the momenta; masses in one unit alone can tell."""
+            if march.weights is NO_WEIGHTS:
+                return False
+            return is_solved(now.worst.rows, (march.slow_size(now.z), march.fast_size(now.x)))
+
         def judged(now: Passed, before: Progress) -> Progress:
             slow, fast = march.slow_size(now.dz), now.worst.moved
             # dz is the next slow correction itself; the next fast one is expected from the last two, or without a pair
@@ -183,8 +189,7 @@ class Marched(StepSolver):
             # a first correction that is round-off: the prediction was exact, and matrices that contract leave less than
             # the floor of the next
             at_floor = accepted.at_floor(size, jnp.where(before.passes > 0, before.size, 0.0))
-            if march.weights is not NO_WEIGHTS:
-                at_floor |= (size > before.size / 2) & is_solved(now.worst.rows, motions)
+            at_floor |= (size > before.size / 2) & is_roundoff(now)
             result = jnp.where(ratio <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
             failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
             result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
@@ -206,7 +211,8 @@ class Marched(StepSolver):
             at_floor = renews & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
             result = jnp.where(at_floor & (after.result == RUNNING), Result.CONVERGED_AT_ROUNDOFF, after.result)
             # corrections at round-off do not tell how fast the iteration contracts
-            ratio = jnp.where((last.passes > 0) & ~accepted.is_roundoff(last.size), after.size / last.size, last.rate)
+            is_noise = accepted.is_roundoff(last.size) | is_roundoff(now)
+            ratio = jnp.where((last.passes > 0) & ~is_noise, after.size / last.size, last.rate)
             curvature = jnp.maximum(last.curvature, jnp.where(renews, 0.0, ratio / last.new_size))
             kept = ratio if self.is_exact else jnp.maximum(ratio, last.rate)
             rate = jnp.where(renews, curvature * after.size, kept)  # kappa |d_new|

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,8 +11,8 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.arrays import Number, Numbers
-from vmri_jax.mechanics.invariants import velocity_and_masses
-from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.projection import is_quadratic, masses_of_function, project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns
@@ -81,7 +80,7 @@ class SolvedMemory(NamedTuple):
     multiplier, slow_multiplier: Lagrange multipliers of the step before, at its last control node with multipliers.
     last_dt: length of the step before, 0 before the first step.
     velocity: mean velocities (v_s, v_f) of the last intervals, ``(q_s(H) - q_s(0)) / H`` and
-        ``(q_f(H) - q_f(H - h)) / h``; () for constant masses.
+        ``(q_f(H) - q_f(H - h)) / h``, before the first step see `Solved.init`; () for constant masses.
     solver: memory of the solver.
     """
 
@@ -110,8 +109,16 @@ class Solved(Stepper):
     def init(self, state: State, macro_dt) -> SolvedMemory:
         n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
         solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt))
-        at_rest = () if self.system.has_constant_mass else (jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f))
-        return SolvedMemory(jnp.zeros(n_g), jnp.zeros(n_gs), jnp.zeros(()), at_rest, solver)
+        return SolvedMemory(jnp.zeros(n_g), jnp.zeros(n_gs), jnp.zeros(()), self._first_velocity(state), solver)
+
+    def _first_velocity(self, state: State) -> tuple:
+        """Velocities (v_s, v_f) of the first guess: none for constant masses. At rest where T is quadratic: the first
+        correction by its masses leads to the velocities of the momenta."""
+        if self.system.has_constant_mass:
+            return ()
+        if is_quadratic(self.system, state.q_s, state.q_f):
+            return jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f)
+        return jax.lax.stop_gradient(velocity(self.system, state.q_s, state.q_f, state.p_s, state.p_f))
 
     def renew(self, state: State, memory: SolvedMemory, macro_dt) -> SolvedMemory:
         return memory._replace(
@@ -139,14 +146,13 @@ class Solved(Stepper):
         """The solution, from straight motion: at the velocities of the projected momenta for constant masses; else,
         since near poles of angles a velocity ``M^-1 p`` says little about the next step, at the mean velocities of the
         last intervals."""
-        system, phase = equations.system, (equations.q_s, equations.q_f, equations.p_s, equations.p_f)
+        system, q_s, q_f, masses = equations.system, equations.q_s, equations.q_f, None
         if system.has_constant_mass:
-            state = State(equations.t, *phase)
-            _, _, v_s, v_f, masses = project_momentum(system, state, sparsity=self.sparsity)
+            state = State(equations.t, q_s, q_f, equations.p_s, equations.p_f)
+            _, _, v_s, v_f, _ = project_momentum(system, state, sparsity=self.sparsity)
         else:
-            velocities, masses = velocity_and_masses(system, *phase)
-            is_first = equations.last_dt == 0
-            v_s, v_f = jax.tree.map(partial(jnp.where, is_first), velocities, memory.velocity)
+            v_s, v_f = memory.velocity
+            masses, _ = masses_of_function(system, q_s, q_f, jnp.zeros(q_s.size + q_f.size))
         guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
