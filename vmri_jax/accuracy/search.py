@@ -262,10 +262,13 @@ class Search:
         return trial
 
     def _observed_order(self, before: Trial, after: Trial) -> float:
-        """The order between two trials, from 1 to the order of the scheme: kinks of a force lower it."""
+        """The order between two trials, from 1 to the order of the scheme: kinks of a force lower it. An error that
+        grows, as beside a resonance of smooth forces, tells no order."""
         if not (before.error > 0 and 0 < after.error < np.inf) or before.run.num_steps == after.run.num_steps:
             return 1.0
         falls, grows = np.log(before.error / after.error), np.log(after.run.num_steps / before.run.num_steps)
+        if falls <= 0 and not self.drives.jump:
+            return float(after.run.order)
         return float(np.clip(falls / grows, 1.0, after.run.order))
 
     def rounded(self, num_steps: int) -> tuple[int, int]:
