@@ -40,7 +40,12 @@ from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights, largest
-from vmri_jax.steppers.null_space import inverse_with_multipliers
+from vmri_jax.steppers.null_space import inverse_by_library, inverse_with_multipliers
+
+FEWEST_IN_PARTS = 4
+"""Fewest variables with masses that vary for which LAPACK inverts the matrices of the masses. XLA compiles a loop of steps
+with such a call in parts, without one as one kernel, in which a step of two angles takes a third of the time. With a
+larger number an engine waits 1.5 times as long for its first result; with a smaller one steps of few angles are slower."""
 
 
 class Matrices(NamedTuple):
@@ -105,6 +110,8 @@ class MarchEquations:
         """The equations with the quadratic form of the masses in place of a kinetic energy that is a function."""
         march = copy(self)
         march.intervals = self.intervals.by_masses()
+        if self.n_s + self.n_f >= FEWEST_IN_PARTS:
+            march.inverted = inverse_by_library
         return march
 
     def flat(self, x: Unknowns):

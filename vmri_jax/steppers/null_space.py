@@ -52,6 +52,11 @@ def inverse_with_multipliers(a, b, c, nodes: int):
     return inverse(saddle(a, b, c) if b.shape[-1] else a)
 
 
+def inverse_by_library(a, b, c, nodes: int):
+    """`inverse_with_multipliers` by LAPACK."""
+    return jnp.linalg.inv(saddle(a, b, c) if b.shape[-1] else a)
+
+
 def inverse_without_multipliers(a, b, c, nodes: int):
     """Inverse of ``[[A, B], [C, 0]]`` with ``B = -G_0^T`` and ``C = G_1``, block diagonal with one block for each of
     the nodes."""
