@@ -8,14 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.functions import (
-    NO_TIME,
-    NO_VELOCITY,
-    Order,
-    Rheonomic,
-    check_arguments,
-    order_of,
-)
+from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, Order, Rheonomic, check_arguments, order_of
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.slots import check_computed
 from vmri_jax.mechanics.summary import numbers, parameters, summary
