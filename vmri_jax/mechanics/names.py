@@ -127,6 +127,17 @@ class Names:
             number += size
         return rows
 
+    def place_of(self, body: str) -> Place:
+        """The place of a body, in (Q_s, Q_f) of the kinematics if it is a function of the coordinates.
+
+        Raises:
+            ValueError: no body of this name.
+        """
+        places = {**self.bodies, **self.carried}
+        if body not in places:
+            raise Refused(unknown("body", body, places))
+        return places[body]
+
     def of(self, system: System, n_s: int, n_f: int) -> "Names":
         """These names, completed by plain names for coordinates and constraints of a system without a name.
 

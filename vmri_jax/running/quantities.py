@@ -134,10 +134,7 @@ class Quantities:
         """(..., k, size) of a body: a part of the `values` (slow, fast) of all coordinates, or of `_of_bodies`."""
         if in_joints:
             values = at_nodes(_of_bodies, self.origin, self.states, self.names.kinematics, kind)
-        places = {**self.names.bodies, **self.names.carried}
-        if body not in places:
-            raise Refused(unknown("body", body, places))
-        part, start, size = places[body]
+        part, start, size = self.names.place_of(body)
         return values[part == "f"][..., start : start + size]
 
     def multipliers(self, micro: bool = False) -> dict:
