@@ -170,10 +170,10 @@ def test_entries_that_are_seen(function, seen):
 
 
 def test_entries_are_taken_and_put_back():
-    entries = Entries.of([False, True, True, False, True])
+    entries = Entries((False, True, True, False, True))
     rows = jnp.arange(10.0).reshape(2, 5)
-    assert (entries.count, entries.runs) == (3, ((1, 3), (4, 5)))
+    assert (entries.count, entries.ends) == (3, [1, 3, 4, 5])
     assert entries.take(rows).tolist() == [[1, 2, 4], [6, 7, 9]]
     assert entries.put(-entries.take(rows), rows).tolist() == [[0, -1, -2, 3, -4], [5, -6, -7, 8, -9]]
-    none = Entries.of([False, False])
+    none = Entries((False, False))
     assert none.put(none.take(jnp.ones(2)), jnp.ones(2)).tolist() == [1, 1]

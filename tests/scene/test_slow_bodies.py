@@ -63,7 +63,7 @@ def test_a_micro_interval_does_not_cost_more_with_more_slow_bodies():
 
 def test_what_carries_a_fast_body_is_seen():
     march, _ = march_of(satellite(3, "wheel 1"))
-    assert march.intervals.seen.runs == ((0, 12), (13, 14))
+    assert march.intervals.seen.ends == [0, 12, 13, 14]
 
 
 @pytest.mark.parametrize("carried_by", ["hub", "wheel 1"])

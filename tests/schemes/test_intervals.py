@@ -96,7 +96,7 @@ def test_intervals_sample_the_path_at_the_nodes_of_the_rule(degree, num_micro):
             IntervalPath(slow[0], slow[1:] - slow[0], ends[m], fast[m * degree + 1 : (m + 1) * degree + 1] - ends[m])
             for m in range(num_micro)
         ]
-        return [nodes.sample(paths[m], equations, Entries.of([True] * 2), m, names) for nodes, m in pieces]
+        return [nodes.sample(paths[m], equations, Entries((True, True)), m, names) for nodes, m in pieces]
 
     for (nodes, m), found in zip(pieces, sampled(slow, fast), strict=True):
         theta, c, points = nodes.theta[m], nodes.c[m], fast[m * degree : (m + 1) * degree + 1]

@@ -11,7 +11,7 @@ import inspect
 from collections import Counter
 from collections.abc import Callable, Hashable
 from functools import lru_cache, wraps
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import jax
 
@@ -37,40 +37,34 @@ TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
 """Names of arguments that only forces, kinetic energies and `Rheonomic` constraints get."""
 
 
-class Order(NamedTuple):
-    """Names in a dictionary in the order of writing, and orders of its entries.
-
-    Args:
-        names: keys of the dictionary; None for a list, a tuple or another node of a pytree.
-        parts: order of each entry, None for an entry without dictionaries.
-    """
-
-    names: tuple[Any, ...] | None
-    parts: tuple["Order | None", ...]
+Order: TypeAlias = tuple[tuple[Any, ...] | None, tuple[Any, ...]]
+"""Names in a dictionary in the order of writing, None for a list, a tuple or another node of a pytree; and the order of
+each entry, None for an entry without dictionaries."""
 
 
 def order_of(tree: Any) -> Order | None:
     """The order of all dictionaries in a pytree; None if there is only one order."""
     if isinstance(tree, dict):
         parts = tuple(map(order_of, tree.values()))
-        return Order(tuple(tree), parts) if len(tree) > 1 or any(parts) else None
+        return (tuple(tree), parts) if len(tree) > 1 or any(parts) else None
     parts = tuple(None if child is tree else order_of(child) for child in _children(tree)[0])
-    return Order(None, parts) if any(parts) else None
+    return (None, parts) if any(parts) else None
 
 
 def in_order(tree: Any, order: Order | None) -> Any:
     """The pytree with its dictionaries in an order; names that the order does not know come last."""
     if order is None:
         return tree
-    if order.names is not None and isinstance(tree, dict):
-        parts, ordered = dict(zip(order.names, order.parts, strict=True)), tree.copy()
-        for name in [*(name for name in parts if name in tree), *(name for name in tree if name not in parts)]:
-            ordered[name] = in_order(ordered.pop(name), parts.get(name))  # moved to the end
+    names, parts = order
+    if names is not None and isinstance(tree, dict):
+        of_names, ordered = dict(zip(names, parts, strict=True)), tree.copy()
+        for name in [*(name for name in names if name in tree), *(name for name in tree if name not in of_names)]:
+            ordered[name] = in_order(ordered.pop(name), of_names.get(name))  # moved to the end
         return ordered
     children, structure = _children(tree)
-    if order.names is not None or len(children) != len(order.parts):
+    if names is not None or len(children) != len(parts):
         return tree
-    return jax.tree.unflatten(structure, map(in_order, children, order.parts))
+    return jax.tree.unflatten(structure, map(in_order, children, parts))
 
 
 def _children(tree: Any) -> tuple[list, Any]:

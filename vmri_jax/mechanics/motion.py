@@ -60,9 +60,7 @@ def motion(system: System, state: State) -> Motion:
 
     t = jnp.asarray(state.t)
     of_motion = partial(lagrangian, system, n_s)
-    forces = force_of(of_motion, q, v)
-    if system.force is not None:
-        forces += jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))
+    forces = force_of(of_motion, q, v) + jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))
     jacobian = jax.jacrev(constraints, argnums=1)(t, q)
     gamma = jax.jvp(rates, (t, q), (jnp.ones_like(t), v))[1]
 

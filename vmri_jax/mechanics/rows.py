@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, chain, pairwise
+from itertools import chain, pairwise
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -42,46 +42,32 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True)
 class Entries:
-    """Some entries of vectors (n,), as static slices.
+    """The entries of vectors (n,) with a True in `marked` (n,), as static slices."""
 
-    Args:
-        runs: first entry of each run of neighbours, and the one after its last.
-        size: n.
-    """
-
-    runs: tuple[tuple[int, int], ...]
-    size: int
-
-    @classmethod
-    def of(cls, marked: Sequence[bool]) -> "Entries":
-        """The entries with a True in `marked` (n,)."""
-        ends = [i for i, (a, b) in enumerate(pairwise([False, *marked, False])) if a != b]
-        return cls(tuple(zip(ends[::2], ends[1::2], strict=True)), len(marked))
+    marked: tuple[bool, ...]
 
     @property
     def count(self) -> int:
         """Number of the entries."""
-        return sum(stop - start for start, stop in self.runs)
+        return sum(self.marked)
 
     @property
-    def marked(self) -> np.ndarray:
-        """(n,) whether an entry is one of them."""
-        runs = (range(*run) for run in self.runs)
-        return np.isin(np.arange(self.size), [i for run in runs for i in run])
+    def ends(self) -> list[int]:
+        """The first entry of each run of neighbours, and the one after its last, in turn."""
+        return [i for i, (a, b) in enumerate(pairwise([False, *self.marked, False])) if a != b]
 
     def take(self, vectors):
-        """(..., count) the entries of vectors (..., n)."""
-        if self.count == self.size:
+        """(..., k) the k entries of vectors (..., n)."""
+        if all(self.marked):
             return vectors
-        taken = split_at(vectors, *chain(*self.runs))[1::2]
+        taken = split_at(vectors, *self.ends)[1::2]
         return jnp.concatenate([np.zeros((*vectors.shape[:-1], 0)), *taken], axis=-1)
 
     def put(self, entries, vectors):
-        """Vectors (..., n) with these entries replaced by `entries` (..., count)."""
-        if self.count == self.size:
+        """Vectors (..., n) with these entries replaced by `entries` (..., k)."""
+        if all(self.marked):
             return entries
-        kept = split_at(vectors, *chain(*self.runs))[::2]
-        new = split_at(entries, *accumulate(stop - start for start, stop in self.runs))
+        kept, new = split_at(vectors, *self.ends)[::2], split_at(entries, *np.cumsum(np.diff(self.ends)[::2]))
         return jnp.concatenate([*chain(*zip(kept, new, strict=True))], axis=-1)
 
 

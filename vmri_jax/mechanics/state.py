@@ -259,15 +259,14 @@ class Problem:
             check_type("Problem: names", self.names, Names, "vmri_jax.Names(slow={...}, fast={...})")
         slots = [self._make_flat(part) for part in ("s", "f")]
         names = "q_s", "q_f", "v_s", "v_f"
-        for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
-            object.__setattr__(self, name, array)
+        vars(self).update(zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True))
         if slots != [None, None]:
-            object.__setattr__(self, "system", flat_system(self.system, *slots))
+            vars(self)["system"] = flat_system(self.system, *slots)
         if self.names is None:
             return
         check_system(self.system, self.q_s, self.q_f)
         if slots != [None, None]:
-            object.__setattr__(self, "names", self._with_rows(self.names))
+            vars(self)["names"] = self._with_rows(self.names)
         self.names.of(self.system, self.q_s.size, self.q_f.size)
 
     def _make_flat(self, part: Part) -> Slots | None:
@@ -288,11 +287,9 @@ class Problem:
                     "arrays."
                 )
             velocity = slots.flat(f"Problem: v_{part}", velocity, zeros=True)
-        object.__setattr__(self, f"q_{part}", position)
-        object.__setattr__(self, f"v_{part}", velocity)
+        vars(self).update({f"q_{part}": position, f"v_{part}": velocity})
         if slots is not None:
-            bodies = {"slow" if part == "s" else "fast": dict(slots.shapes)}
-            object.__setattr__(self, "names", replace(names, **bodies))
+            vars(self)["names"] = replace(names, **{"slow" if part == "s" else "fast": dict(slots.shapes)})
         return slots
 
     def _with_rows(self, names: Names) -> Names:

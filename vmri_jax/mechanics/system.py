@@ -1,7 +1,6 @@
 """The physics of a system: plain JAX functions of slow and fast variables, written by the user."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,14 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.functions import (
-    NO_TIME,
-    NO_VELOCITY,
-    Order,
-    Rheonomic,
-    check_arguments,
-    order_of,
-)
+from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, Order, Rheonomic, check_arguments, order_of
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.slots import check_computed
 from vmri_jax.mechanics.summary import numbers, parameters, summary
@@ -242,9 +234,7 @@ class System(eqx.Module):
 
     def constraint_rates(self, t, q_s, q_f, v_s, v_f):
         """Rates of all constraint values, ``G v + dg/dt``, shape (n_g + n_gs,)."""
-        if self.is_rheonomic:
-            return jax.jvp(self.constraints, (t, q_s, q_f), (jnp.ones_like(t), v_s, v_f))[1]
-        return jax.jvp(partial(self.constraints, t), (q_s, q_f), (v_s, v_f))[1]
+        return jax.jvp(self.constraints, (t, q_s, q_f), (jnp.ones_like(t), v_s, v_f))[1]
 
     def num_constraints(self, q_s, q_f) -> tuple[int, int]:
         """``(n_g, n_gs)`` for configurations of these shapes."""

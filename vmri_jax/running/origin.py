@@ -16,7 +16,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library, of_one_type
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
-from vmri_jax.mechanics.state import HasProblem, Problem, opened
+from vmri_jax.mechanics.state import Movable, Problem, opened
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import Working
@@ -98,7 +98,7 @@ class Origin:
     settings: Settings | None = None
 
     @classmethod
-    def of(cls, moving: System | Problem | HasProblem) -> "Origin":
+    def of(cls, moving: Movable) -> "Origin":
         """The origin of runs of a system, a problem or a scene."""
         system = opened(moving)
         system = system.system if isinstance(system, Problem) else system

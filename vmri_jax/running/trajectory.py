@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, is_known, numbers_of
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.invariants import energy_parts
-from vmri_jax.mechanics.state import HasProblem, Problem, State
+from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
@@ -157,7 +157,7 @@ class Trajectory(Exports):
         """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run."""
         return self.origin.settings  # pyright: ignore[reportReturnType]
 
-    def of(self, moving: System | Problem | HasProblem) -> "Trajectory":
+    def of(self, moving: Movable) -> "Trajectory":
         """The same run with its origin: its system, and the names of bodies and constraints.
 
         Args:
@@ -172,7 +172,7 @@ class Trajectory(Exports):
             run._check_energy()
         return run
 
-    def _with_origin(self, moving: System | Problem | HasProblem) -> "Trajectory":
+    def _with_origin(self, moving: Movable) -> "Trajectory":
         """The same states with an origin of as many coordinates, and all lanes of a batch with the same one."""
         origin = replace(Origin.of(moving), settings=self.settings)
         n_s, n_f = self.states.q_s.shape[-1], self.states.q_f.shape[-1]
@@ -302,9 +302,7 @@ class Trajectory(Exports):
         return from_named_arrays(arrays, origin)
 
 
-def in_coordinates(
-    run: Trajectory, moving: System | Problem | HasProblem, q: tuple[Any, Any], v: tuple[Any, Any]
-) -> Trajectory:
+def in_coordinates(run: Trajectory, moving: Movable, q: tuple[Any, Any], v: tuple[Any, Any]) -> Trajectory:
     """The motion of a run in the coordinates of another system, without micro nodes and error.
 
     Its momenta are ``dT/dv`` of that system: kinetic effects, such as rotors and charges in a magnetic field, add to

@@ -215,8 +215,9 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
 def _taken(placed: Sequence[Placed], layout: Layout) -> dict[Any, Entries]:
     """The rows that each function of constraints takes of its terms."""
     rows = rows_of(placed, layout)
-    taken: dict[Any, Entries] = {home: Entries.of([row.kept for row in rows if row.home == home]) for home in HOMES}
-    return taken | {"implied": Entries.of([not row.kept for row in rows if placed[row.part].dropped])}
+    marked: dict[Any, list] = {home: [row.kept for row in rows if row.home == home] for home in HOMES}
+    marked["implied"] = [not row.kept for row in rows if placed[row.part].dropped]
+    return {home: Entries(tuple(of_home)) for home, of_home in marked.items()}
 
 
 def actuation(sorting: Sorting) -> Actuation | None:

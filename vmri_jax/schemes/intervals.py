@@ -97,7 +97,7 @@ class Intervals:
         """
         masses, n_s = self.equations.masses, self.equations.q_s.size
         assert masses is not None
-        is_seen = self.seen.marked
+        is_seen = jnp.array(self.seen.marked, dtype=bool)
         of_slow = jnp.where(is_seen[:, None] & is_seen, 0.0, masses[:n_s, :n_s])
 
         def with_masses(term: TermOnNodes) -> TermOnNodes:
@@ -123,9 +123,9 @@ class Intervals:
             return integrands, system.g(equations.t, values_of["q_s"], values_of["q_f"])
 
         if self._force_nodes:
-            return Entries.of([True] * n_s)
+            return Entries((True,) * n_s)
         marked = entries_seen(values, jnp.concatenate([equations.q_s, equations.q_s]))
-        return Entries.of((marked[:n_s] | marked[n_s:]).tolist())
+        return Entries(tuple((marked[:n_s] | marked[n_s:]).tolist()))
 
     def start(self) -> Arriving:
         """The quantities that arrive at the first interval."""

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple, overload
 import jax
 import numpy as np
 
-from vmri_jax.mechanics.state import HasProblem, Problem, State
+from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.mechanics.summary import summary
-from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.engine import Cursor
 from vmri_jax.running.export import NODES, named_coordinates
@@ -127,7 +126,7 @@ class StoredTrajectory:
         title = f"StoredTrajectory {self.path}: {len(self)} saved nodes, one every {self.save_every} macro steps"
         return summary(title, lines)
 
-    def of(self, moving: System | Problem | HasProblem) -> "StoredTrajectory":
+    def of(self, moving: Movable) -> "StoredTrajectory":
         """The same run with its system, see `Trajectory.of`."""
         self[-1:].of(moving)  # refuses the system of another run
         return self.with_origin(self[:1].of(moving).origin)

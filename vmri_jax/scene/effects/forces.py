@@ -11,7 +11,6 @@ import numpy as np
 
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, names, number, of_time, positive, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.springs import BetweenPoints
@@ -75,13 +74,11 @@ class MagneticField(Effect):
     def check_parameters(self):
         super().check_parameters()
         shape = self.parameters["field"].shape
-        for (name,) in self.elements:
-            size = end_of(self.by_name, name).size
-            needed = () if size == 2 else (3,)
-            if shape != needed:
+        for (end,) in self.ends:
+            if shape != (() if end.size == 2 else (3,)):
                 raise Refused(
-                    f"{self.name}: field has shape {shape} and {name} has dimension {size}; give a number in the "
-                    "plane, a vector (3,) in space."
+                    f"{self.name}: field has shape {shape} and {end.name} has dimension {end.size}; give a number in "
+                    "the plane, a vector (3,) in space."
                 )
 
 

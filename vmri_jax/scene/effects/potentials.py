@@ -369,11 +369,9 @@ class SphereContact(_Contact):
     def check_parameters(self):
         super().check_parameters()
         center = self.parameters["center"]
-        for (name,) in self.elements:
-            position = end_of(self.by_name, name).position
-            self.require(
-                (position != center).any(), f"the start of {name}", position, "it must not be the center of the sphere"
-            )
+        for (end,) in self.ends:
+            differs, expected = (end.position != center).any(), "it must not be the center of the sphere"
+            self.require(differs, f"the start of {end.name}", end.position, expected)
 
     def drawing(self):
         params = self.parameters
