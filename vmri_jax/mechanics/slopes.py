@@ -49,7 +49,7 @@ class ScaledRows(NamedTuple):
 
     def allowed(self, tolerance, solved: int):
         """(k,) the values up to which rows count as kept; those after the `solved` ones are implied."""
-        is_implied = np.arange(self.values.shape[0]) >= solved
+        is_implied = np.arange(self.values.shape[-1]) >= solved
         return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * (self.rounding + is_implied)
 
 
