@@ -12,6 +12,7 @@ from tests.user_systems import arms_kinetic, bent_system, double_pendulum
 from vmri_jax import ConstantMass, Problem, Rheonomic, State, System, fully_implicit, initial_state, simulate
 from vmri_jax.diagnostics import constraint_residual, velocity
 from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.steppers.results import Method
 from vmri_jax.systems import triple_spherical_pendulum
 
 
@@ -213,7 +214,7 @@ def soft_and_coupled(q_s, q_f, params):
     return jnp.sum(q_s**2 + q_s * q_f) / 2
 
 
-@pytest.mark.parametrize(("kinetic", "v"), [(quartic_kinetic, 3.0), (relativistic_kinetic, 0.9)])
+@pytest.mark.parametrize(("kinetic", "v"), [(quartic_kinetic, 3.0), (relativistic_kinetic, 1 - 5e-8)])
 def test_velocity_of_a_kinetic_energy_that_is_not_quadratic(kinetic, v):
     system = System(kinetic, slow_potential=soft_and_coupled)
     state = initial_state(system, [0.0], [0.1], [v], [0.5])
@@ -226,6 +227,7 @@ def test_relativistic_run_keeps_its_energy_band():
     state = initial_state(system, [0.0], [0.1], [0.9], [0.0])
     run = simulate(system, fully_implicit(4), state, macro_dt=0.02, num_steps=500)
     assert np.abs(run.energy - run.energy[0]).max() < 5e-4  # measured 4e-5 with a stiff spring besides
+    assert run.info.method.max() == Method.MASSES  # masses of the motion, 12 times those at rest
 
 
 def test_velocities_may_be_traced_where_the_kinetic_energy_is_a_function():

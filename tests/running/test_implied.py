@@ -25,6 +25,11 @@ def at_times(t, q_s, q_f, params):
     return on_a_tilted_line(q_s, q_f, params) + 0.0 * t
 
 
+def across_the_plane(q_s, q_f, params):
+    """Round-off alone, as the row across the plane of a linkage."""
+    return 6e-17 * jax.numpy.cos(q_f[1:2])
+
+
 def falling(tilt, implied=on_a_tilted_line) -> Problem:
     mass = ConstantMass(np.zeros(0), [1.0, 1.0])
     system = System(mass, constraint=on_a_line, implied=implied, params={"tilt": np.array(tilt)})
@@ -38,6 +43,7 @@ def test_rows_that_follow_cost_no_multiplier_and_count_in_the_residual():
     assert problem.system.num_constraints(problem.q_s, problem.q_f) == (1, 0)
     assert list(run.multipliers()) == ["constraint"]
     assert run.constraint_residual.max() < 1e-15  # measured 0
+    assert vm.simulate(falling(0.0, across_the_plane), SCHEME, **STEPS).success
     tilted = vm.simulate(falling(1e-14), SCHEME, **STEPS)  # below the round-off of positions, and seen
     np.testing.assert_allclose(tilted.constraint_residual[:, 0], 1e-14 * tilted.q_f[:, 1], atol=1e-27)
     np.testing.assert_allclose(tilted.constraint_residual[:, 1], 1e-14, rtol=1e-12)

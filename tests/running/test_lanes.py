@@ -299,3 +299,12 @@ def test_params_nested_partial_and_shared():
     assert largest_difference(with_dots.q_f[0], batch.q_f[1]) == 0
     with pytest.raises(ValueError, match=r"no parameter 'rods.maas'. Did you mean rods.mass. There are gravity"):
         vm.simulate_batch(rod(), vm.fully_explicit(1), params={"rods": {"maas": [1.0]}}, macro_dt=0.01, num_steps=3)
+
+
+def test_errors_before_a_failure_are_certified_by_the_motion_up_to_it():
+    """The second step of the lane fails, and its first one is wrong by a third of it."""
+    with pytest.warns(vm.FailedLanesWarning, match="1 of 2 lanes"):
+        batch = vm.simulate_batch(rod(), vm.fully_explicit(1), macro_dt=np.array([0.01, 0.55]), num_steps=3, error=True)
+    assert np.isfinite(batch.q_f[1, 1]).all()
+    assert batch.error.certified_until.tolist() == [0.03, 0.0]
+    assert np.nanmax(batch.error.positions) < 1e-4  # measured 1e-5 of the other lane

@@ -274,8 +274,9 @@ def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarr
 
 
 def extent_of(trajectory: Trajectory) -> float:
-    """Largest difference between the largest and the smallest value of a coordinate in a run."""
-    return float(np.ptp(positions(trajectory), axis=0).max(initial=0.0))
+    """Largest difference between the largest and the smallest value of a coordinate in a run, up to a failure."""
+    q = positions(trajectory)
+    return float(np.ptp(q[np.isfinite(q).all(axis=1)], axis=0).max(initial=0.0))
 
 
 def check_function_of_run(of: Callable | None, run: Simulation) -> None:

@@ -102,15 +102,10 @@ def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
 
 
 def are_kept(rows: ScaledRows, solved: int, tolerance):
-    """Whether a state of a run keeps the rows that are solved for, and the implied ones.
-
-    Args:
-        rows: at the state.
-        solved: number of rows that are solved for.
-        tolerance: of the solver.
-    """
+    """Whether a state of a run keeps the first `solved` rows, for which steps solve, and the implied ones after them,
+    with the tolerance of the solver."""
     tolerance = jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
-    kept = jnp.abs(rows.values) <= rows.allowed(tolerance)
+    kept = jnp.abs(rows.values) <= rows.allowed(tolerance, solved)
     return jnp.all(kept[:solved]), jnp.all(kept[solved:])
 
 
@@ -199,7 +194,7 @@ def check_constraints(
         raise Refused(f"{place}: the constraints are {solved} there, which is not finite.")
     if not np.isfinite(rows.gradients).all():
         raise Refused("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
-    allowed = rows.allowed(tolerance)[: len(solved)]
+    allowed = rows.allowed(tolerance, len(solved))[: len(solved)]
     violated = np.abs(solved) > allowed
     if violated.any():
         _check_gradients(system, state, held, rows, weights)  # of a square, which no start fulfils to round-off
@@ -210,7 +205,7 @@ def check_constraints(
             f"{abs(solved[worst]):.3e} (allowed: {allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); "
             f"{advice}"
         )
-    implied, allowed = (a[len(solved) :] for a in (rows.values, rows.allowed(CONSTRAINT_TOLERANCE)))
+    implied, allowed = (a[len(solved) :] for a in (rows.values, rows.allowed(CONSTRAINT_TOLERANCE, len(solved))))
     opened = np.flatnonzero(~(np.abs(implied) <= allowed))
     if opened.size:
         raise Refused(

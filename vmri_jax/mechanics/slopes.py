@@ -7,7 +7,8 @@ Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints c
 
 with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), its change over its
 radius of curvature, and the largest position ``max_k |w_k q_k|`` or, if that is larger, the displacement that the
-constraints take from a step: at the origin the round-off of this displacement is all that there is. The weights w,
+constraints take from a step: at the origin the round-off of this displacement is all that there is. An implied row is
+of order one, and so is its rounding: of the row across the plane of a linkage all terms are round-off. The weights w,
 square roots of the masses, give all coordinates one unit: lengths of gradients and reach_i, the change of a row over
 the largest position, which bounds its round-off, are taken with them.
 """
@@ -46,9 +47,10 @@ class ScaledRows(NamedTuple):
     rounding: Float[Numbers, "k"]
     gradients: Float[Numbers, "k n"]
 
-    def allowed(self, tolerance):
-        """(k,) the values up to which rows count as kept."""
-        return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * self.rounding
+    def allowed(self, tolerance, solved: int):
+        """(k,) the values up to which rows count as kept; those after the `solved` ones are implied."""
+        is_implied = np.arange(self.values.shape[-1]) >= solved
+        return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * (self.rounding + is_implied)
 
 
 class Slopes(NamedTuple):

@@ -152,7 +152,7 @@ class Solved(Stepper):
             _, _, v_s, v_f, _ = project_momentum(system, state, sparsity=self.sparsity)
         else:
             v_s, v_f = memory.velocity
-            masses, _ = masses_of_function(system, q_s, q_f, jnp.zeros(q_s.size + q_f.size))
+            masses, _ = masses_of_function(system, q_s, q_f, jnp.concatenate(memory.velocity))
         guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
