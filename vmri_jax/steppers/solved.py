@@ -80,7 +80,7 @@ class SolvedMemory(NamedTuple):
     multiplier, slow_multiplier: Lagrange multipliers of the step before, at its last control node with multipliers.
     last_dt: length of the step before, 0 before the first step.
     velocity: mean velocities (v_s, v_f) of the last intervals, ``(q_s(H) - q_s(0)) / H`` and
-        ``(q_f(H) - q_f(H - h)) / h``, before the first step see `Solved.init`; () for constant masses.
+        ``(q_f(H) - q_f(H - h)) / h``; before the first step those of the first guess; () for constant masses.
     solver: memory of the solver.
     """
 
