@@ -276,7 +276,8 @@ def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarr
 def extent_of(trajectory: Trajectory) -> float:
     """Largest difference between the largest and the smallest value of a coordinate in a run, up to a failure."""
     q = positions(trajectory)
-    return float(np.ptp(q[np.isfinite(q).all(axis=1)], axis=0).max(initial=0.0))
+    q = q[np.isfinite(q).all(axis=1)]
+    return float(np.ptp(q, axis=0).max(initial=0.0)) if len(q) else 0.0
 
 
 def check_function_of_run(of: Callable | None, run: Simulation) -> None:
