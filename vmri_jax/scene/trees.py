@@ -31,8 +31,8 @@ from vmri_jax.scene.terms import split
 LONGEST = 100
 """Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic
 energy couples all joints of a tree, so that the time of a step grows at last with the third power of this length; by
-directors it grows in proportion. On a hinged chain of 30 bars a step in joint coordinates takes 0.17 of the time by
-directors, on 100 bars 0.94 of it."""
+directors it grows in proportion. On a hinged chain of 30 bars a step in joint coordinates takes 0.18 of the time by
+directors, on 100 bars 0.25 of it."""
 JOINTS_OF_A_LOOP = 5
 """Fewest joints for each loop of a scene for which coordinates="auto" chooses joint coordinates. In denser loops the
 constraints of the cut joints take away most of the coordinates, and each depends on all joints of its loop: in a row of
