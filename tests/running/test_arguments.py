@@ -22,6 +22,7 @@ def test_several_micro_steps_for_nothing_fast(scheme, num_fast, told):
     assert ("Take num_micro=1" in nothing_fast(scheme, num_fast)) == told
 
 
+@pytest.mark.compiles
 def test_runs_of_known_numbers_in_a_program(fpu):
     """A function without arguments in jit: JAX compiles the run as a part of it."""
     state, steps = fpu.state(), {"macro_dt": 0.01, "num_steps": 2}

@@ -108,7 +108,7 @@ def options_of_runs() -> dict:
     XLA refuses programs with unknown options, and versions without this one have to run.
     """
     try:
-        jax.jit(lambda: 0.0, compiler_options=OLDER_EMITTERS).lower().compile()
+        jax.jit(_zero, compiler_options=OLDER_EMITTERS).lower().compile()
     except jax.errors.JaxRuntimeError:
         return {}
     return OLDER_EMITTERS
