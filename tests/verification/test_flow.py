@@ -5,6 +5,7 @@ Most runs have the schemes of `SCHEMES` and `NUM_SAVES` saved intervals, so that
 
 from functools import cache
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -222,6 +223,22 @@ def test_angular_momentum_and_constraints_of_the_pendulum_over_10000_steps(schem
     position, velocity = np.asarray(run.constraint_residual).max(axis=0)
     assert position < 2e-13  # measured 2.2e-14, 1e-12 wanted
     assert velocity < 2e-13  # measured 2.3e-14, 1e-10 wanted
+
+
+def only_differences(q_s, q_f, params):
+    q = jnp.concatenate([q_s, q_f]).reshape(-1, 3)
+    return jnp.sum(jnp.sum((q[1:] - q[:-1]) ** 2, axis=1) ** 2)
+
+
+@pytest.mark.parametrize("scheme", [vm.explicit_slow(5), vm.galerkin(2, 2)], ids=["explicit slow", "gauss 2"])
+def test_linear_momentum_of_free_bodies(scheme):
+    """Of the pendulum without its pivot: slow and fast variables push each other on both grids."""
+    system = PROBLEMS["tsp"]().system.replace(slow_potential=only_differences, slow_constraint=None)
+    run = vm.simulate(system, scheme, generic_state("tsp"), macro_dt=0.005, num_steps=200)
+    momenta = [p for _, p in bodies(run)]
+    total = np.sum(momenta, axis=0)
+    assert largest_difference(momenta[0][-1], momenta[0][0]) > 0.01
+    assert largest_difference(total, total[0]) < 1e-12 * np.abs(total[0]).max()
 
 
 def hanging_pendulum():
