@@ -155,6 +155,18 @@ def test_step_is_symplectic(name, scheme):
     assert area_change_of(name, rules[scheme]) < 1e-12  # measured 1e-13
 
 
+def test_the_measure_of_symplecticity_sees_drag():
+    """A step that shrinks all momenta by a thousandth shrinks areas as much."""
+    rng = np.random.default_rng(1)
+    middle = rng.normal(size=4)
+
+    def ends(x):
+        q, p = np.split(middle + x, 2)
+        return vm.State(0.0, q[:1], q[1:], p[:1], p[1:]), vm.State(1.0, q[:1], q[1:], 0.999 * p[:1], 0.999 * p[1:])
+
+    assert area_change(ends, 4) == pytest.approx(1e-3, rel=1e-6)
+
+
 def there_and_back(name, scheme):
     """A step, momenta turned, a step, momenta turned: the state between and at the end."""
 
