@@ -147,13 +147,12 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def _slopes(shape: str, number: int, band: dict[int, float], joint: dict[int, float], size: Size) -> list[Claim]:
-    """Of log time against log bodies, after the largest number of a shape: of the band a target, in joint coordinates
-    none."""
+    """Of log time against log bodies, after the largest number of a shape: with a target."""
     claims = []
     if number != (size.bodies if shape == "chain" else size.stars)[-1]:
         return claims
-    for what, us, most in (("", band, 1.15), (", joint coordinates", joint, None)):
-        many = [n for n in us if n >= (FROM if most else JOINT_FROM)]
+    for what, us, least, most in (("", band, FROM, 1.15), (", joint coordinates", joint, JOINT_FROM, 1.2)):
+        many = [n for n in us if n >= least]
         if len(many) > 1:
             found = slope(np.array(many), np.array([us[n] for n in many]))
             words = f"{shape}{what}: slope of log time against log bodies, {many[0]} to {many[-1]}"

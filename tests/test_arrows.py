@@ -17,7 +17,7 @@ LINES = {
     ("control",): 880,
     ("ensembles", "executors"): 1490,
     ("plots",): 1000,
-    (".",): 36_238,
+    (".",): 36_235,
 }
 """Most lines of packages that have reached their number, and of the whole: a change that adds takes away."""
 

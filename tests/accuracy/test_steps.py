@@ -4,6 +4,7 @@ meet."""
 import pickle
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from tests.small_systems import SYSTEMS, no_constraint
 from vmri_jax.accuracy import search
 from vmri_jax.accuracy.companions import Trial
 from vmri_jax.accuracy.families import of_order_2
+from vmri_jax.mechanics.driving import Events
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
 from vmri_jax.study import reference_solution
@@ -172,3 +174,14 @@ def test_more_steps_than_there_may_be_are_not_tried(monkeypatch):
 def test_refused(arguments, message):
     with pytest.raises(vm.Refused, match=message):
         vm.simulate(SYSTEMS["slow_alone"], **arguments)
+
+
+@pytest.mark.parametrize(("errors", "order"), [((1e-4, 1e-4 / 2**3), 3.0), ((1e-4, 9e-5), 1.0), ((5e-6, 2e-5), 6.0)])
+def test_an_error_that_grows_tells_no_order(errors, order):
+    """Beside a resonance the next run took as many steps as an error of order 1 needs."""
+    trials = (
+        SimpleNamespace(error=error, run=SimpleNamespace(num_steps=steps, order=6))
+        for error, steps in zip(errors, (20, 40), strict=True)
+    )
+    observed = search.Search._observed_order(SimpleNamespace(drives=Events()), *trials)  # pyright: ignore
+    assert observed == pytest.approx(order)

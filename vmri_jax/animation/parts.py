@@ -139,7 +139,7 @@ def entries(data: dict, key: str, where: str) -> list:
 
 
 def _floats(value: Any) -> np.ndarray:
-    """An array of floats, of one NaN where the value is no array of numbers."""
+    """The value as an array of floats; a single NaN where it has other entries than numbers."""
     try:
         return np.asarray(value, dtype=float)
     except (TypeError, ValueError):

@@ -34,6 +34,10 @@ CONTRACTION = 0.03
 as four passes with kept matrices for constant masses, more in joint coordinates. A smaller ratio makes more passes
 exact. A larger ratio makes passes cheaper but raises their number: 0.1 takes a quarter more passes, in 0.8 of the time
 for the satellite of the gallery, in 0.9 to 1.0 of it for a double pendulum in angles."""
+FEWEST_IN_PARTS = 4
+"""Fewest variables with masses that vary for which LAPACK inverts the matrices of the masses. XLA compiles a loop of
+steps with such a call in parts, without one as one kernel, in which a step of two angles takes a third of the time.
+With a larger number an engine waits 1.7 times as long for its first result, and takes 0.8 of the time for a step."""
 LARGEST_RENEWED = 16
 """Most rows of the matrix K of a micro interval that every macro step computes anew; a larger K is kept until a step
 takes more than `EXTRA_PASSES` passes above the fewest with it (`vmri_jax.steppers.nested`). With a larger number, macro

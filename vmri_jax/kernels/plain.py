@@ -9,6 +9,8 @@ CONTRACTION = -1.0
 """Largest ratio of two corrections with which matrices are kept: negative, so that all passes are exact."""
 LARGEST_RENEWED = 10**9
 """Rows of K up to which every macro step computes it: all sizes."""
+FEWEST_IN_PARTS = 10**9
+"""No system has so many variables: all take `inverse`."""
 DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = LANES_IN_TURN = False
 """Steppers and batches do not use any special case."""
 

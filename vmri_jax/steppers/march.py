@@ -35,17 +35,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vmri_jax.kernels import matmul, matvec, max_abs
+from vmri_jax.kernels import FEWEST_IN_PARTS, matmul, matvec, max_abs
 from vmri_jax.mechanics.arrays import split_at
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights, largest
-from vmri_jax.steppers.null_space import inverse_by_library, inverse_with_multipliers
-
-FEWEST_IN_PARTS = 4
-"""Fewest variables with masses that vary for which LAPACK inverts the matrices of the masses. XLA compiles a loop of
-steps with such a call in parts, without one as one kernel, in which a step of two angles takes a third of the time.
-With a larger number an engine waits 1.7 times as long for its first result, and takes 0.8 of the time for a step."""
+from vmri_jax.steppers.null_space import inverse_with_multipliers
 
 
 class Matrices(NamedTuple):
@@ -111,7 +106,7 @@ class MarchEquations:
         march = copy(self)
         march.intervals = self.intervals.by_masses()
         if self.n_s + self.n_f >= FEWEST_IN_PARTS:
-            march.inverted = inverse_by_library
+            march.inverted = partial(inverse_with_multipliers, inverted=jnp.linalg.inv)
         return march
 
     def flat(self, x: Unknowns):

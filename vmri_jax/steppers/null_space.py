@@ -46,15 +46,10 @@ def motions(jacobian):
     return q[..., n_g:], q[..., :n_g] @ jax.scipy.linalg.solve_triangular(square, eye, lower=True)
 
 
-def inverse_with_multipliers(a, b, c, nodes: int):
+def inverse_with_multipliers(a, b, c, nodes: int, inverted=inverse):
     """The inverse of ``[[A, B], [C, 0]]`` by elimination, regularised for dependent constraints
-    (`vmri_jax.kernels.saddle`)."""
-    return inverse(saddle(a, b, c) if b.shape[-1] else a)
-
-
-def inverse_by_library(a, b, c, nodes: int):
-    """`inverse_with_multipliers` by LAPACK."""
-    return jnp.linalg.inv(saddle(a, b, c) if b.shape[-1] else a)
+    (`vmri_jax.kernels.saddle`); `inverted` inverts a matrix."""
+    return inverted(saddle(a, b, c) if b.shape[-1] else a)
 
 
 def inverse_without_multipliers(a, b, c, nodes: int):
